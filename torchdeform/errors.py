@@ -1,0 +1,29 @@
+"""Typed errors: one sentence that says what is wrong, where, and what to do about it."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class TorchdeformError(Exception):
+    """Base of every error that this package raises on purpose."""
+
+
+class InputError(TorchdeformError, ValueError):
+    """The caller's input is wrong: a shape, a value, a file or a setting (exit code 2 at the shell)."""
+
+
+class ComputationError(TorchdeformError, RuntimeError):
+    """The input was fine, the computation failed (exit code 1 at the shell)."""
+
+
+def nearest_name(name: str, known: Iterable[str]) -> str:
+    """Return ``"; did you mean 'x'?"`` for the known name nearest to ``name``, else an empty string."""
+    match = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f"; did you mean '{match[0]}'?" if match else ""
+
+
+def require_choice(value: str, choices: Iterable[str], where: str) -> None:
+    """Raise `InputError` unless ``value`` is one of ``choices``."""
+    known = sorted(choices)
+    if value not in known:
+        raise InputError(f"{where} must be one of {', '.join(known)}, got {value!r}{nearest_name(str(value), known)}")
