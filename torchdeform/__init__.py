@@ -1,0 +1,84 @@
+"""torchdeform: registration of images by maps that do not fold, built from divergence and curl.
+
+The names below are loaded when they are first used, so ``import torchdeform`` costs little more than ``import torch``.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+# Not lazy: the module `warp` would hide the function of the same name as soon as anything imports it.
+from torchdeform.warp import compose, invert, warp
+
+if TYPE_CHECKING:
+    from torchdeform.config import load_settings
+    from torchdeform.diagnostics import Diagnosis, diagnose
+    from torchdeform.errors import ComputationError, InputError, TorchdeformError
+    from torchdeform.fem import Weights, solve_div_curl
+    from torchdeform.flow import integrate
+    from torchdeform.grid import Grid
+    from torchdeform.image import Image
+    from torchdeform.io import read_image, write_image
+    from torchdeform.registration.deformable import register
+    from torchdeform.registration.result import RegistrationResult
+    from torchdeform.registration.settings import RegistrationSettings
+    from torchdeform.solvers.solution import Solution, Status
+    from torchdeform.stencil import curl, divergence, jacobian_determinant
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "config": ("load_settings",),
+    "diagnostics": ("Diagnosis", "diagnose"),
+    "errors": ("ComputationError", "InputError", "TorchdeformError"),
+    "fem": ("Weights", "solve_div_curl"),
+    "flow": ("integrate",),
+    "grid": ("Grid",),
+    "image": ("Image",),
+    "io": ("read_image", "write_image"),
+    "registration.deformable": ("register",),
+    "registration.result": ("RegistrationResult",),
+    "registration.settings": ("RegistrationSettings",),
+    "solvers.solution": ("Solution", "Status"),
+    "stencil": ("curl", "divergence", "jacobian_determinant"),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "ComputationError",
+    "Diagnosis",
+    "Grid",
+    "Image",
+    "InputError",
+    "RegistrationResult",
+    "RegistrationSettings",
+    "Solution",
+    "Status",
+    "TorchdeformError",
+    "Weights",
+    "compose",
+    "curl",
+    "diagnose",
+    "divergence",
+    "integrate",
+    "invert",
+    "jacobian_determinant",
+    "load_settings",
+    "read_image",
+    "register",
+    "solve_div_curl",
+    "warp",
+    "write_image",
+]
+
+
+def __getattr__(name: str) -> object:
+    """Load a public name on its first use (PEP 562)."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'torchdeform' has no attribute {name!r}")
+    value = getattr(import_module(f"torchdeform.{_HOME_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

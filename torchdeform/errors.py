@@ -22,8 +22,9 @@ def nearest_name(name: str, known: Iterable[str]) -> str:
     return f"; did you mean '{match[0]}'?" if match else ""
 
 
-def require_choice(value: str, choices: Iterable[str], where: str) -> None:
-    """Raise `InputError` unless ``value`` is one of ``choices``."""
-    known = sorted(choices)
+def require_choice(value: object, choices: Iterable[object], where: str) -> None:
+    """Raise `InputError` unless ``value`` is one of ``choices``; ``where`` names the argument or setting."""
+    known = list(choices)
     if value not in known:
-        raise InputError(f"{where} must be one of {', '.join(known)}, got {value!r}{nearest_name(str(value), known)}")
+        names = [str(choice) for choice in known]
+        raise InputError(f"{where} must be one of {', '.join(names)}, got {value!r}{nearest_name(str(value), names)}")

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from operator import index
 
 import torch
 from torch import Tensor
@@ -27,8 +28,12 @@ class Grid:
     spacing: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        shape = tuple(int(n) for n in self.shape)
-        spacing = tuple(float(h) for h in self.spacing) or (1.0,) * len(shape)
+        try:
+            shape = tuple(index(n) for n in self.shape)
+            spacing = tuple(float(h) for h in self.spacing) or (1.0,) * len(shape)
+        except (TypeError, ValueError) as error:
+            message = f"Grid: shape must be whole numbers and spacing must be numbers, got {self.shape}, {self.spacing}"
+            raise InputError(message) from error
         if len(shape) not in (2, 3) or min(shape) < 2:
             raise InputError(f"Grid: shape must have 2 or 3 axes of at least 2 nodes, got {shape}")
         if len(spacing) != len(shape) or not all(math.isfinite(h) and h > 0 for h in spacing):
@@ -67,13 +72,11 @@ class Grid:
 
     def points(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None) -> Tensor:
         """Return the node positions x as a ``(1, D, *S)`` tensor in units of spacing, node 0 at the origin."""
-        steps = [
-            torch.arange(n, dtype=dtype, device=device) * h for n, h in zip(self.shape, self.spacing, strict=True)
-        ]
+        steps = [torch.arange(n, dtype=dtype, device=device) * h for n, h in zip(self.shape, self.spacing, strict=True)]
         return torch.stack(torch.meshgrid(*steps, indexing="ij")).unsqueeze(0)
 
     def quadrature(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None) -> Tensor:
-        """Return the trapezoidal weights ``(1, 1, *S)`` with Σ w f = ∫ f for every Q1 function f; they add up to |Ω|."""
+        """Return the trapezoidal weights ``(1, 1, *S)`` with Σ w f = ∫ f for every Q1 function f; their sum is |Ω|."""
         weights = torch.full((1, 1, *self.shape), self.cell_volume, dtype=dtype, device=device)
         for axis, end in product(self.axes, (0, -1)):
             weights.select(axis, end).mul_(0.5)
@@ -91,7 +94,8 @@ class Grid:
             kind = field.dtype if isinstance(field, Tensor) else type(field).__name__
             raise InputError(f"{name} must be a floating-point tensor, got {kind}")
         channels = field.shape[1] if components is None and field.dim() > 1 else components
-        if field.dim() != self.dim + 2 or field.shape[1] != channels or tuple(field.shape[2:]) != self.shape:
+        shaped = field.dim() == self.dim + 2 and field.shape[1] == channels and tuple(field.shape[2:]) == self.shape
+        if not shaped or field.numel() == 0:
             want = ", ".join(["B", "C" if components is None else str(components), *map(str, self.shape)])
             raise InputError(f"{name} must have shape ({want}), got {tuple(field.shape)}")
 

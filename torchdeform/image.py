@@ -1,6 +1,7 @@
 """An image in physical space: values on a grid, and where that grid lies in the world (ITK's LPS convention)."""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -8,6 +9,9 @@ from torch import Tensor
 from torchdeform.errors import InputError
 from torchdeform.grid import Grid
 from torchdeform.warp import sample
+
+# Alpha that means opaque, by pixel type; floating types count from 0 to 1.
+_OPAQUE = {"uint8": 255.0, "uint16": 65535.0}
 
 
 @dataclass(frozen=True)
@@ -18,7 +22,8 @@ class Image:
         data: ``(1, C, *S)`` floating point, array order (z, y, x) or (y, x).
         grid: shape and spacing in array order.
         origin: world position (x, y, z) of node 0 in LPS mm; zeros by default.
-        direction: ITK's direction matrix, columns are the world directions of the x, y, z index axes; identity by default.
+        direction: ITK's direction matrix, columns are the world directions of the x, y, z index axes; identity by
+            default.
         name: what to call it in messages, usually its path.
         pixel_type: numpy name of the type it is stored with, for writing results alike.
 
@@ -31,7 +36,7 @@ class Image:
     origin: tuple[float, ...] = ()
     direction: tuple[tuple[float, ...], ...] = ()
     name: str = "image"
-    pixel_type: str = field(default="float32")
+    pixel_type: str = "float32"
 
     def __post_init__(self) -> None:
         dim = self.grid.dim
@@ -41,7 +46,9 @@ class Image:
         object.__setattr__(self, "direction", tuple(tuple(map(float, r)) for r in self.direction) or identity)
         if len(self.origin) != dim or len(self.direction) != dim or {len(r) for r in self.direction} != {dim}:
             raise InputError(f"{self.name}: origin and direction must have {dim} axes like the image")
-        if abs(float(torch.linalg.det(torch.tensor(self.direction, dtype=torch.float64)))) < 1e-6:
+        if not all(map(math.isfinite, self.origin)):
+            raise InputError(f"{self.name}: its origin {self.origin} is not finite; mend the file's header")
+        if not abs(float(torch.linalg.det(torch.tensor(self.direction, dtype=torch.float64)))) > 1e-6:
             raise InputError(f"{self.name}: its direction matrix is singular; mend the file's header")
 
     def to_world(self, points: Tensor) -> Tensor:
@@ -53,11 +60,16 @@ class Image:
         inverse = torch.linalg.inv(self._rotation(world))
         return torch.einsum("ij,bj...->bi...", inverse, world - self._offset(world)).flip(1)
 
+    def to(self, device: torch.device | str) -> "Image":
+        """Return the same image with its pixels on ``device``."""
+        return replace(self, data=self.data.to(device))
+
     def _rotation(self, like: Tensor) -> Tensor:
         return torch.tensor(self.direction, dtype=like.dtype, device=like.device)
 
     def _offset(self, like: Tensor) -> Tensor:
-        return self.grid.along(self.origin, like)
+        origin = torch.tensor(self.origin, dtype=like.dtype, device=like.device)
+        return origin.view(1, -1, *([1] * (like.dim() - 2)))  # points may come as a list as well as on a grid
 
 
 def resample(
@@ -68,7 +80,8 @@ def resample(
     Args:
         moving: the image to sample.
         fixed: the image whose grid is wanted.
-        u: displacement ``(1, D, *S)`` on the fixed grid (array order, units of spacing); φ = id + u, identity when None.
+        u: displacement ``(1, D, *S)`` on the fixed grid (array order, units of spacing) of φ = id + u; zero when
+            None.
         mode: ``linear`` or ``nearest``.
         outside: value outside the moving image (ITK's resampler uses 0); None continues its edge.
 
@@ -82,3 +95,61 @@ def resample(
     if u is not None:
         points = points + u
     return sample(moving.data, moving.to_grid(fixed.to_world(points)), moving.grid, mode=mode, outside=outside)
+
+
+def luminance(image: Image) -> Image:
+    """Return the grey image that colour is registered on, Y = 0.299 R + 0.587 G + 0.114 B; grey images as they are.
+
+    Args:
+        image: 1 channel (grey), 3 (RGB) or 4 (RGBA; what is transparent counts as black).
+
+    Returns:
+        The image with one channel, in the same place.
+
+    Raises:
+        InputError: another number of channels.
+
+    Notes:
+        Differentiable and linear in the colours.
+    """
+    channels = image.data.shape[1]
+    if channels == 1:
+        return image
+    if channels not in (3, 4):
+        raise InputError(f"{image.name} has {channels} channels; give a grey (1), RGB (3) or RGBA (4) image")
+    from kornia.color import rgb_to_grayscale
+
+    colours = image.data[:, :3]
+    if channels == 4:
+        colours = colours * (image.data[:, 3:] / _OPAQUE.get(image.pixel_type, 1.0))
+    grey = rgb_to_grayscale(colours.flatten(2).unsqueeze(-1))  # one column of pixels, whatever the dimension
+    return replace(image, data=grey.view(1, 1, *image.grid.shape))
+
+
+def require_registrable(image: Image) -> None:
+    """Raise `InputError` unless the pixels are finite and not all the same: otherwise there is nothing to align."""
+    if not bool(image.data.isfinite().all()):
+        raise InputError(f"{image.name} has pixels that are NaN or infinite; replace them first, for instance by 0")
+    if bool((image.data == image.data.flatten(2)[:, :, 0].view(1, -1, *([1] * image.grid.dim))).all()):
+        raise InputError(f"{image.name} is constant, so there is nothing to align; check that it is the right file")
+
+
+def overlap(fixed: Image, moving: Image, *, samples: int = 32) -> float:
+    """Return the share of the fixed grid that lies inside the moving image, 0 (apart) to 1 (covered).
+
+    Args:
+        fixed: the image whose grid is looked at.
+        moving: the image it should lie in; both are taken in their physical place.
+        samples: nodes looked at along each axis, the first and the last among them.
+
+    Raises:
+        InputError: one image is 2D and the other 3D.
+    """
+    if fixed.grid.dim != moving.grid.dim:
+        kinds = f"{fixed.name} is {fixed.grid.dim}D but {moving.name} is {moving.grid.dim}D"
+        raise InputError(f"{kinds}; give two images of the same dimension")
+    sides = [torch.linspace(0, side, samples, dtype=torch.float64) for side in fixed.grid.extent]
+    points = torch.stack(torch.meshgrid(*sides, indexing="ij")).unsqueeze(0)
+    index = moving.to_grid(fixed.to_world(points)) / moving.grid.along(moving.grid.spacing, points)
+    last = moving.grid.along([n - 1 for n in moving.grid.shape], points)
+    return float(((index >= -0.5) & (index <= last + 0.5)).all(dim=1).double().mean())
