@@ -1,0 +1,1 @@
+"""Linear solvers: conjugate gradients, fast transforms, and what a solver returns."""

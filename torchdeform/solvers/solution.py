@@ -10,10 +10,11 @@ class Status(Enum):
     """How a solve ended; the value is a sentence that names the remedy."""
 
     CONVERGED = "converged"
-    MAX_STEPS = "stopped at max_steps before the tolerance was met: raise max_steps, rtol, or use a better preconditioner"
+    MAX_STEPS = "stopped at max_steps before the tolerance was met: raise max_steps or rtol, or precondition better"
     BREAKDOWN = "the operator is not positive definite on this right-hand side: check weights and boundary conditions"
     NON_FINITE = "the right-hand side or the operator is not finite: check the input for NaN and infinity"
-    STAGNATED = "no step brings the residual down any more: the data may be inconsistent, the value is the least-squares answer"
+    STAGNATED = "no step brings the residual down any more: inconsistent data? the value is the least-squares answer"
+    ROUNDING = "rounding keeps the residual above the tolerance: use float64, or raise rtol"
 
     @property
     def ok(self) -> bool:

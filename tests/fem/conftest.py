@@ -1,0 +1,113 @@
+"""Oracles for finite elements, written without the package: dense matrices by Gauss quadrature, loop by loop."""
+
+import itertools
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+# (row, column) of the derivative matrix ∂_column v_row with their signs, one list per row of the form.
+DIV_CURL = {
+    2: [[(0, 0, 1), (1, 1, 1)], [(1, 0, 1), (0, 1, -1)]],
+    3: [
+        [(0, 0, 1), (1, 1, 1), (2, 2, 1)],
+        [(2, 1, 1), (1, 2, -1)],
+        [(0, 2, 1), (2, 0, -1)],
+        [(1, 0, 1), (0, 1, -1)],
+    ],
+}
+
+
+class Brute:
+    """Q1 elements on a box: every integral a sum over the Gauss points of every element."""
+
+    def __init__(self, shape: tuple[int, ...], spacing: tuple[float, ...], points: int = 3) -> None:
+        self.shape, self.spacing, self.dim = shape, spacing, len(shape)
+        self.nodes = np.arange(math.prod(shape)).reshape(shape)
+        self.corners = list(itertools.product((0, 1), repeat=self.dim))
+        places, weights = np.polynomial.legendre.leggauss(points)
+        self.gauss = [
+            (q, math.prod(w) * math.prod(spacing) / 2**self.dim)
+            for q, w in zip(
+                itertools.product((places + 1) / 2, repeat=self.dim),
+                itertools.product(weights, repeat=self.dim),
+                strict=True,
+            )
+        ]
+
+    def shape_function(self, corner: tuple[int, ...], q: tuple[float, ...], axis: int | None) -> float:
+        """∂_axis N_corner at q of the unit element (N itself for None)."""
+        value = 1.0
+        for a in range(self.dim):
+            if a == axis:
+                value *= (1 if corner[a] else -1) / self.spacing[a]
+            else:
+                value *= q[a] if corner[a] else 1 - q[a]
+        return value
+
+    def unknowns(self, element: tuple[int, ...], components: int) -> list[int]:
+        local = [int(self.nodes[tuple(e + c for e, c in zip(element, corner, strict=True))]) for corner in self.corners]
+        return [k * self.nodes.size + n for k in range(components) for n in local]
+
+    def row(self, terms, q: tuple[float, ...], components: int) -> np.ndarray:
+        """Σ c ∂_axis v_k at q as a vector over the unknowns of an element; ``terms`` holds (k, axis, c)."""
+        vector = np.zeros((components, len(self.corners)))
+        for k, axis, c in terms:
+            vector[k] += [c * self.shape_function(corner, q, axis) for corner in self.corners]
+        return vector.flatten()
+
+    def matrix(self, rows: Callable, components: int) -> Tensor:
+        """Dense matrix of Σ weight row(v)²; ``rows(element, q index)`` gives (weight, terms) for each row."""
+        total = np.zeros((components * self.nodes.size,) * 2)
+        for element in itertools.product(*(range(n - 1) for n in self.shape)):
+            local = np.zeros((components * len(self.corners),) * 2)
+            for index, (q, volume) in enumerate(self.gauss):
+                for weight, terms in rows(element, index):
+                    vector = self.row(terms, q, components)
+                    local += volume * weight * np.outer(vector, vector)
+            where = self.unknowns(element, components)
+            total[np.ix_(where, where)] += local
+        return torch.from_numpy(total)
+
+    def load(self, rows: Callable, data: Tensor, components: int) -> Tensor:
+        """Dense right-hand side of Σ weight data_row row(N), ``data (R, *S)`` interpolated between its nodes."""
+        total = np.zeros(components * self.nodes.size)
+        values = data.numpy().reshape(len(data), -1)
+        for element in itertools.product(*(range(n - 1) for n in self.shape)):
+            here = values[:, self.unknowns(element, 1)]
+            for index, (q, volume) in enumerate(self.gauss):
+                interpolated = here @ np.array([self.shape_function(c, q, None) for c in self.corners])
+                for (weight, terms), value in zip(rows(element, index), interpolated, strict=True):
+                    total[self.unknowns(element, components)] += (
+                        volume * weight * value * self.row(terms, q, components)
+                    )
+        return torch.from_numpy(total)
+
+    def div_curl(self, div=1.0, curl=1.0, zero=0.0) -> Callable:
+        """Rows of the div-curl form; a weight is a number or an array over the elements."""
+
+        def at(weight, element):
+            return weight if isinstance(weight, float) else float(weight[element])
+
+        def rows(element, index):
+            first, *others = DIV_CURL[self.dim]
+            yield at(div, element), first
+            yield from ((at(curl, element), other) for other in others)
+            if not isinstance(zero, float) or zero > 0:
+                yield from ((at(zero, element), [(k, None, 1.0)]) for k in range(self.dim))
+
+        return rows
+
+
+@pytest.fixture
+def brute() -> type[Brute]:
+    """The brute-force assembly: ``brute(shape, spacing, points=3)``."""
+    return Brute
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    torch.manual_seed(0)

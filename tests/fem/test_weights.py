@@ -1,0 +1,71 @@
+"""The weights of the div-curl least squares."""
+
+import math
+
+import pytest
+import torch
+
+from torchdeform.errors import InputError
+from torchdeform.fem.weights import Weights
+from torchdeform.grid import Grid
+
+GRID = Grid((4, 5))
+
+
+def test_what_is_constant_and_what_is_isotropic():
+    per_item, per_element = torch.rand(3, 1, 1, 1) + 1, torch.rand(1, 1, 3, 4) + 1
+    assert Weights().constant
+    assert Weights(2.0, 2.0, 0.1).isotropic
+    assert not Weights(2.0, 1.0).isotropic
+    assert Weights(per_item, 1.0).constant
+    assert not Weights(1.0, per_element).constant
+    assert Weights(per_item, per_item.clone()).isotropic
+    assert not Weights(per_item, 1.0).isotropic
+    wanted = torch.tensor(1.0, requires_grad=True)
+    assert not Weights(wanted, 1.0).isotropic
+    assert Weights(wanted, wanted).isotropic
+    assert Weights(1.0, 1.0, torch.tensor(0.1)).zero_positive
+    assert not Weights().zero_positive
+
+
+def test_the_mean_is_taken_over_elements_only():
+    weight = torch.rand(3, 1, 3, 4) + 1
+    mean = Weights(weight, 2.0, torch.tensor(0.5)).mean()
+    torch.testing.assert_close(mean.div, weight.mean(dim=(1, 2, 3), keepdim=True))
+    assert mean.curl == 2.0
+    assert mean.constant
+
+
+def test_tensors_can_be_exchanged_and_moved():
+    weights = Weights(torch.ones(1, 1, 3, 4), 2.0, torch.tensor(0.5))
+    assert len(weights.tensors) == 2
+    other = weights.with_tensors((torch.zeros(1), torch.ones(1)))
+    assert float(other.div) == 0
+    assert other.curl == 2.0
+    assert float(other.zero) == 1
+    assert all(w.dtype == torch.float64 for w in weights.to(torch.zeros(1, dtype=torch.float64)).tensors)
+
+
+@pytest.mark.parametrize("bad", [{"div": 0.0}, {"curl": -1.0}, {"zero": -1e-3}, {"div": math.nan}, {"zero": math.inf}])
+def test_numbers_out_of_range_are_refused(bad):
+    with pytest.raises(InputError, match=f"Weights: {next(iter(bad))} must be finite"):
+        Weights(**bad)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (torch.ones(3, 4), r"must be a number or have shape \(B, 1, 3, 4\)"),
+        (torch.ones(1, 1, 4, 5), r"must be a number or have shape \(B, 1, 3, 4\)"),
+        (torch.ones(1, 2, 3, 4), r"must be a number or have shape \(B, 1, 3, 4\)"),
+        (torch.zeros(1, 1, 3, 4), "must be finite and positive, got 0"),
+        (torch.full((1, 1, 3, 4), math.nan), "must be finite and positive"),
+    ],
+)
+def test_tensors_that_do_not_fit_are_refused(bad, message):
+    with pytest.raises(InputError, match=message):
+        Weights(div=bad).check(GRID)
+
+
+def test_tensors_that_fit_are_taken():
+    Weights(torch.ones(2, 1, 3, 4), torch.ones(1, 1, 1, 4), torch.tensor(0.0)).check(GRID)

@@ -1,0 +1,238 @@
+"""Batched preconditioned conjugate gradients with implicit derivatives."""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+from torchdeform.errors import InputError
+from torchdeform.solvers.solution import Solution, Status
+
+# ‖r‖ ≤ rtol ‖b‖ is asked for when nothing else is said.
+DEFAULT_RTOL = {torch.float32: 1e-5, torch.float64: 1e-10}
+
+
+@dataclass(frozen=True)
+class Operator:
+    """A self-adjoint, positive definite x ↦ A(θ) x on each item of a batch.
+
+    Args:
+        apply: ``apply(x, *parameters)`` returns A x, ``(B, ...)`` like x, each item from its own x alone.
+        parameters: the tensors θ; gradients reach those that want one.
+    """
+
+    apply: Callable[..., Tensor]
+    parameters: tuple[Tensor, ...] = ()
+
+    def __call__(self, x: Tensor) -> Tensor:
+        return self.apply(x, *self.parameters)
+
+
+def conjugate_gradient(
+    operator: Operator | Callable[[Tensor], Tensor],
+    b: Tensor,
+    *,
+    preconditioner: Callable[[Tensor], Tensor] | None = None,
+    x0: Tensor | None = None,
+    rtol: float | None = None,
+    atol: float = 0.0,
+    max_steps: int = 1000,
+) -> Solution:
+    """Solve A x = b for each item until ‖b − A x‖ ≤ max(rtol ‖b‖, atol), with the Euclidean norm of that item.
+
+    Args:
+        operator: A, self-adjoint and positive definite; an `Operator` where gradients are to reach what it is made of.
+        b: ``(B, ...)``.
+        preconditioner: r ↦ z ≈ A⁻¹ r, self-adjoint and positive definite, item by item; none by default.
+        x0: where to start, ``(B, ...)``; zero by default.
+        rtol: relative tolerance, by default `DEFAULT_RTOL` of the dtype.
+        atol: absolute tolerance.
+        max_steps: steps at most for each item.
+
+    Returns:
+        `Solution`; the residual is computed anew from the result. An item that is not finite has the value NaN.
+
+    Raises:
+        InputError: b or x0 is not a float32 or float64 tensor with a batch axis, a tolerance is negative, or
+            ``operator`` uses a tensor that wants a gradient and is not among its parameters.
+
+    Notes:
+        An item that is done is frozen, so a batch gives the results of its items one by one. When the residual computed
+        anew misses the tolerance that the recurrence met, the item starts again from there as long as that halves it.
+        The derivative of x along (db, dA) is A⁻¹ (db − dA x): one more solve, itself differentiable, that warns when it
+        fails. x0 has none.
+        One transfer from the device per step.
+    """
+    operator = operator if isinstance(operator, Operator) else Operator(operator)
+    _check(b, x0, rtol, atol, max_steps)
+    rtol = DEFAULT_RTOL[b.dtype] if rtol is None else rtol
+    settings = _Settings(preconditioner, rtol, atol, max_steps, watch=torch.is_grad_enabled())
+    report: list[Solution] = []
+    value = _Implicit.apply(operator.apply, settings, x0, report, b, *operator.parameters)
+    return replace(report[0], value=value)
+
+
+@dataclass(frozen=True)
+class _Settings:
+    preconditioner: Callable[[Tensor], Tensor] | None
+    rtol: float
+    atol: float
+    max_steps: int
+    watch: bool
+
+
+def _check(b: Tensor, x0: Tensor | None, rtol: float | None, atol: float, max_steps: int) -> None:
+    if not isinstance(b, Tensor) or b.dtype not in DEFAULT_RTOL or b.dim() < 2:
+        raise InputError("conjugate_gradient: b must be a float32 or float64 tensor (B, ...)")
+    if x0 is not None and (x0.shape, x0.dtype, x0.device) != (b.shape, b.dtype, b.device):
+        raise InputError(f"conjugate_gradient: x0 must be like b, {tuple(b.shape)} of {b.dtype} on {b.device}")
+    if atol < 0 or (rtol is not None and rtol < 0) or max_steps < 0:
+        raise InputError("conjugate_gradient: rtol, atol and max_steps must not be negative")
+
+
+class _Implicit(Function):
+    """x = A(θ)⁻¹ b. From A dx = db − dA x and A = Aᵀ, a cotangent g of x is λ = A⁻¹ g for b and −λᵀ (∂A/∂θ) x for θ."""
+
+    @staticmethod
+    def forward(
+        ctx, apply, settings: _Settings, x0: Tensor | None, report: list[Solution], b: Tensor, *parameters: Tensor
+    ):
+        ctx.product, ctx.settings = apply, settings
+        operator = Operator(apply, tuple(p.detach() for p in parameters))
+        report.append(_solve(operator, b.detach(), x0, settings))
+        ctx.save_for_backward(report[0].value, *parameters)
+        return report[0].value
+
+    @staticmethod
+    def backward(ctx, *grads: Tensor):
+        x, *parameters = ctx.saved_tensors
+        report: list[Solution] = []
+        adjoint = _Implicit.apply(ctx.product, replace(ctx.settings, atol=0.0), None, report, grads[0], *parameters)
+        if why := {s.value for s in report[0].status if s in (Status.MAX_STEPS, Status.BREAKDOWN)}:
+            text = f"conjugate_gradient, solving for a gradient: {'; '.join(sorted(why))}"
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
+        gradients = _parameter_gradients(ctx.product, x, parameters, ctx.needs_input_grad[5:], adjoint)
+        return None, None, None, None, adjoint, *gradients
+
+
+def _parameter_gradients(
+    apply: Callable[..., Tensor], x: Tensor, parameters: list[Tensor], wanted: tuple[bool, ...], adjoint: Tensor
+) -> list[Tensor | None]:
+    """Return −λᵀ (∂A/∂θ) x for each wanted θ, with a graph where a further derivative may follow."""
+    if not any(wanted):
+        return [None] * len(parameters)
+    further = torch.is_grad_enabled()
+    with torch.enable_grad():
+        # Fresh aliases keep the derivative from running on into what the parameters, or x, were made of.
+        aliases = [
+            p.view_as(p) if further else p.detach().requires_grad_(w) for p, w in zip(parameters, wanted, strict=True)
+        ]
+        product = apply(x if further else x.detach(), *aliases)
+        chosen = [a for a, w in zip(aliases, wanted, strict=True) if w]
+        found = iter(torch.autograd.grad(product, chosen, -adjoint, create_graph=further, allow_unused=True))
+    return [next(found) if w else None for w in wanted]
+
+
+# What has become of an item; the others are still under way.
+_RUNNING, _MET, _BREAKDOWN, _NON_FINITE, _ROUNDING = range(5)
+_STATUS = (Status.MAX_STEPS, Status.CONVERGED, Status.BREAKDOWN, Status.NON_FINITE, Status.ROUNDING)
+
+
+def _solve(operator: Operator, b: Tensor, x0: Tensor | None, settings: _Settings) -> Solution:
+    """Descend, and again from the residual computed anew as long as that is worth it."""
+    b, x, finite, scale = _scaled(b, x0)
+    norm = _norms(b)
+    tolerance = torch.maximum(settings.rtol * norm, settings.atol / scale.flatten())
+    r = b.clone() if x0 is None else _residual(operator, b, x, settings)
+    before, steps = _norms(r), torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
+    code = torch.where(before <= tolerance, _MET, _RUNNING)
+    while True:
+        code = _descend(operator, settings, (x, r), tolerance, code, steps)
+        r = _residual(operator, b, x, settings)
+        left = _norms(r)
+        missed = (code == _MET) & (left > tolerance)
+        again = missed & (left < before / 2)
+        code = torch.where(missed, torch.where(again, _RUNNING, _ROUNDING), code)
+        if not bool((again & (steps < settings.max_steps)).any()):
+            break
+        before = left
+    code = torch.where(finite, code, _NON_FINITE)
+    lost = code == _NON_FINITE
+    residual = torch.where(lost, torch.nan, torch.where(norm > 0, left / norm, 0))
+    value = torch.where(_wide(lost, x), torch.nan, x * scale)
+    return Solution(value, tuple(_STATUS[c] for c in code.tolist()), steps, residual)
+
+
+def _residual(operator: Operator, b: Tensor, x: Tensor, settings: _Settings) -> Tensor:
+    with torch.set_grad_enabled(settings.watch):
+        product = operator(x)
+    if product.requires_grad:
+        raise InputError(
+            "conjugate_gradient: the operator uses tensors that want a gradient; list them in Operator.parameters"
+        )
+    return b - product
+
+
+def _scaled(b: Tensor, x0: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return b, the start, which items of them are finite, and a power of two per item.
+
+    Items that are not finite are emptied, the others divided by their power so that no square overflows or vanishes.
+    """
+    finite = torch.isfinite(b).flatten(1).all(1)
+    if x0 is not None:
+        finite &= torch.isfinite(x0).flatten(1).all(1)
+    b = torch.where(_wide(finite, b), b, 0)
+    largest = b.abs().flatten(1).amax(1)
+    scale = _wide(torch.ldexp(torch.ones_like(largest), torch.frexp(largest).exponent), b)
+    start = torch.zeros_like(b) if x0 is None else torch.where(_wide(finite & (largest > 0), b), x0.detach(), 0) / scale
+    return b / scale, start, finite, scale
+
+
+def _descend(
+    operator: Operator,
+    settings: _Settings,
+    state: tuple[Tensor, Tensor],
+    tolerance: Tensor,
+    code: Tensor,
+    steps: Tensor,
+) -> Tensor:
+    """Run the recurrence on the items under way; change x, r and steps in place; return what became of the items."""
+    x, r = state
+    p, rz = torch.zeros_like(r), torch.ones_like(tolerance)
+    running = (code == _RUNNING) & (steps < settings.max_steps)
+    while True in (alive := running.tolist()):
+        z = r if settings.preconditioner is None else settings.preconditioner(r)
+        before, rz = rz, _dots(r, z)
+        p.mul_(_wide(rz / before, p)).add_(z)
+        for item, runs in enumerate(alive):
+            if not runs:
+                p[item].zero_()
+        q = operator(p)
+        curvature = _dots(p, q)
+        positive = running & (curvature > 0) & (rz > 0)
+        alpha = _wide(torch.where(positive, rz / curvature, 0), p)
+        x.addcmul_(p, alpha)
+        r.addcmul_(q, alpha, value=-1)
+        left = _norms(r)
+        steps += running
+        became = torch.where((left <= tolerance) | (rz == 0), _MET, torch.where(positive, _RUNNING, _BREAKDOWN))
+        became = torch.where(torch.isfinite(curvature) & torch.isfinite(rz) & torch.isfinite(left), became, _NON_FINITE)
+        code = torch.where(running, became, code)
+        running = (code == _RUNNING) & (steps < settings.max_steps)
+    return code
+
+
+def _dots(a: Tensor, b: Tensor) -> Tensor:
+    """Return a·b for each item ``(B,)``, one by one: a batch may be summed in another order than an item alone."""
+    return torch.stack([torch.dot(i.reshape(-1), j.reshape(-1)) for i, j in zip(a, b, strict=True)])
+
+
+def _norms(a: Tensor) -> Tensor:
+    return _dots(a, a).sqrt()
+
+
+def _wide(per_item: Tensor, like: Tensor) -> Tensor:
+    return per_item.view(-1, *[1] * (like.dim() - 1))
