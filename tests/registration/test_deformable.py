@@ -1,0 +1,216 @@
+"""Registration: recovers known maps, never folds, treats items alike, and says what it did."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchdeform.diagnostics import diagnose
+from torchdeform.errors import InputError
+from torchdeform.flow import integrate
+from torchdeform.grid import Grid
+from torchdeform.image import Image, resample
+from torchdeform.registration.deformable import register
+from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.warp import compose, max_voxels, warp
+
+QUICK = RegistrationSettings(steps=(30, 20, 10), length=6.0, window=7)
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+def blobs(shape: tuple[int, ...], seed: int = 0, items: int = 1) -> Tensor:
+    """A smooth image with structure everywhere."""
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(items, 1, *shape, generator=generator)
+    grid = Grid(shape)
+    for axis in grid.axes:
+        k = torch.fft.rfftfreq(shape[axis - 2]).view([-1 if a == axis else 1 for a in range(2 + grid.dim)])
+        noise = torch.fft.irfft(
+            torch.fft.rfft(noise, dim=axis) * torch.exp(-((k * 18) ** 2)), shape[axis - 2], dim=axis
+        )
+    return (noise - noise.mean()) / noise.std() + 3
+
+
+def bend(grid: Grid, amplitude: float) -> Tensor:
+    """A flow that keeps the boundary, its velocity ``amplitude`` voxels at most."""
+    x = grid.points()
+    phases = [math.pi * x[:, k] / side for k, side in enumerate(grid.extent)]
+    wave = torch.stack(
+        [torch.sin(phases[k]) * torch.cos(2 * phases[(k + 1) % grid.dim] + k) for k in range(grid.dim)], dim=1
+    )
+    return integrate(wave * amplitude * grid.along(grid.spacing, x), grid)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("shape", "similarity"), [((64, 80), "lncc"), ((64, 80), "ssd"), ((32, 28, 36), "lncc")])
+def test_a_known_map_is_found(shape, similarity, device):
+    grid = Grid(shape)
+    moving = blobs(shape).to(device)
+    truth = bend(grid, 3.0).to(device)
+    fixed = warp(moving, truth, grid)
+    if similarity == "lncc":
+        fixed = 40 * fixed + 11  # another brightness is no obstacle
+    result = register(fixed, moving, replace(QUICK, similarity=similarity))
+    inside = (..., *[slice(5, -5)] * grid.dim)
+    before = truth.square().sum(1).sqrt()[inside].mean()
+    after = (result.displacement - truth).square().sum(1).sqrt()[inside].mean()
+    assert before > 1
+    assert after < 0.25 * before
+    assert (result.similarity_after > result.similarity_before).all()
+
+
+@pytest.mark.parametrize("shape", [(48, 40), (24, 20, 28)])
+def test_images_that_have_nothing_in_common_do_not_make_it_fold(shape):
+    greedy = RegistrationSettings(steps=(40, 40, 40), length=2.0, step_length=1.0, similarity="ssd", tolerance=0.0)
+    result = register(blobs(shape, 1), blobs(shape, 2), greedy)
+    assert sum(level.shortened for level in result.levels) > 0  # it had to be held back
+    assert result.diagnosis.folds.item() == 0
+    assert result.diagnosis.smallest.item() > 0
+    assert result.diagnosis.det_min.item() > 0
+    again = diagnose(result.displacement, result.grid)
+    assert again.folds.item() == 0
+
+
+def test_the_map_keeps_the_domain_and_its_inverse_undoes_it():
+    shape = (48, 56)
+    result = register(blobs(shape, 1), blobs(shape, 2), QUICK)
+    grid = result.grid
+    assert max_voxels(compose(result.displacement, result.inverse, grid), grid).item() < 0.01
+    torch.testing.assert_close(
+        max_voxels(compose(result.displacement, result.inverse, grid), grid), result.inverse_error_max
+    )
+    for k, axis in enumerate(grid.axes):
+        for end in (0, -1):
+            assert result.displacement[:, k].select(axis - 1, end).abs().max() < 1e-4
+
+
+def test_identical_images_stay_where_they_are():
+    image = blobs((40, 40))
+    for similarity in ("lncc", "ssd"):
+        result = register(image, image, replace(QUICK, similarity=similarity))
+        assert result.displacement.abs().mean() < 0.02  # LNCC's floor likes a little more contrast
+        assert (result.similarity_after >= result.similarity_before - 1e-6).all()
+
+
+def test_similarity_never_falls_over_a_level():
+    result = register(blobs((64, 64), 1), blobs((64, 64), 2), QUICK)
+    levels = [torch.stack(level.similarity).flatten() for level in result.levels]
+    assert all(values.max() > values[0] for values in levels)
+    assert result.similarity_after.item() == pytest.approx(levels[-1].max().item(), abs=1e-5)
+
+
+def test_a_batch_equals_its_items_one_by_one_with_a_hard_one_among_them():
+    shape = (40, 48)
+    moving = blobs(shape, 3, items=3)
+    fixed = warp(moving, bend(Grid(shape), 2.0), Grid(shape))
+    fixed[1] = blobs(shape, 9)[0]  # nothing in common
+    fixed[2] = moving[2]  # nothing to do
+    together = register(fixed, moving, QUICK)
+    for item in range(3):
+        alone = register(fixed[item : item + 1], moving[item : item + 1], QUICK)
+        torch.testing.assert_close(together.displacement[item], alone.displacement[0], rtol=0, atol=1e-3)
+
+
+def test_the_same_input_gives_the_same_result_bit_for_bit():
+    fixed, moving = blobs((40, 40), 1), blobs((40, 40), 2)
+    first, second = (register(fixed, moving, QUICK) for _ in range(2))
+    assert torch.equal(first.displacement, second.displacement)
+    assert torch.equal(first.inverse, second.inverse)
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (8, 33), (9, 64), (8, 8, 8), (8, 20, 31)])
+def test_any_size_from_eight(shape):
+    result = register(blobs(shape, 1), blobs(shape, 2), replace(QUICK, steps=(5, 5, 5)))
+    assert result.displacement.shape == (1, len(shape), *shape)
+    assert result.diagnosis.folds.item() == 0
+
+
+def test_several_channels_are_used_together():
+    shape = (48, 48)
+    grid, truth = Grid(shape), bend(Grid(shape), 2.0)
+    moving = torch.cat([blobs(shape, 1), torch.zeros(1, 1, *shape), blobs(shape, 2)], dim=1)
+    result = register(warp(moving, truth, grid), moving, QUICK)
+    assert (result.displacement - truth).abs().mean() < 0.3 * truth.abs().mean()
+
+
+def test_double_precision_is_kept():
+    fixed, moving = blobs((32, 32), 1).double(), blobs((32, 32), 2).double()
+    assert register(fixed, moving, replace(QUICK, steps=(3,))).displacement.dtype == torch.float64
+
+
+def test_the_callback_sees_every_step():
+    seen = []
+    register(blobs((32, 32), 1), blobs((32, 32), 2), replace(QUICK, steps=(4, 3), tolerance=0.0), callback=seen.append)
+    assert [(p.level, p.step) for p in seen] == [(0, i) for i in range(5)] + [(1, i) for i in range(4)]
+    assert all(p.levels == 2 and p.similarity.shape == (1,) for p in seen)
+
+
+def test_stiffness_against_volume_change_keeps_volumes():
+    fixed, moving = blobs((48, 48), 1), blobs((48, 48), 2)
+    soft, stiff = (register(fixed, moving, replace(QUICK, weight_div=w)) for w in (1.0, 100.0))
+    assert stiff.diagnosis.det_log_std.item() < 0.5 * soft.diagnosis.det_log_std.item()
+
+
+def test_images_are_taken_in_their_physical_place():
+    shape, spacing = (40, 48), (1.5, 0.8)
+    direction = ((0.8, -0.6), (0.6, 0.8))
+    moving = Image(blobs((60, 56), 4), Grid((60, 56), (1.1, 0.9)), (-12.0, -9.0), direction)
+    frame = Image(torch.zeros(1, 1, *shape), Grid(shape, spacing), (-8.0, -5.0), direction)
+    truth = bend(frame.grid, 2.0)
+    fixed = replace(frame, data=resample(moving, frame, truth, outside=None).float())
+    result = register(fixed, moving, QUICK)
+    assert (result.displacement - truth).abs().mean() < 0.3 * truth.abs().mean()
+    torch.testing.assert_close(result.warped, resample(moving, fixed, result.displacement).float())
+
+
+def test_colours_are_registered_on_luminance_and_warped_in_colour():
+    grid = Grid((40, 40))
+    moving = Image(torch.cat([blobs(grid.shape, s) for s in (1, 2, 3)], dim=1), grid)
+    fixed = replace(moving, data=warp(moving.data, bend(grid, 1.5), grid))
+    result = register(fixed, moving, QUICK)
+    assert result.warped.shape == (1, 3, *grid.shape)
+    assert (result.warped - fixed.data).abs().mean() < 0.5 * (moving.data - fixed.data).abs().mean()
+
+
+@pytest.mark.parametrize(
+    ("fixed", "moving", "message"),
+    [
+        (torch.rand(1, 1, 16, 16), torch.rand(1, 1, 16, 17), "moving must have shape"),
+        (torch.rand(16, 16), torch.rand(16, 16), "fixed must be a tensor"),
+        (torch.rand(1, 1, 16, 16), torch.rand(2, 1, 16, 16), "must agree in batch size"),
+        (torch.rand(1, 1, 16, 7), torch.rand(1, 1, 16, 7), "at least 8 voxels"),
+        (torch.rand(1, 1, 16, 16), torch.full((1, 1, 16, 16), torch.nan), "NaN or infinite"),
+        (torch.rand(1, 1, 16, 16), torch.ones(1, 1, 16, 16), "moving is constant"),
+        (torch.rand(1, 1, 16, 16), Image(torch.rand(1, 1, 16, 16), Grid((16, 16))), "not one of each"),
+        (torch.ones(1, 1, 16, 16, dtype=torch.int32), torch.rand(1, 1, 16, 16), "floating-point"),
+    ],
+)
+def test_bad_input_is_named(fixed, moving, message):
+    with pytest.raises(InputError, match=message):
+        register(fixed, moving, QUICK)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("similarity", "lnc"),
+        ("window", 4),
+        ("window", 1),
+        ("steps", ()),
+        ("steps", (5, -1)),
+        ("power", 3),
+        ("length", 0.0),
+        ("weight_div", -1.0),
+        ("weight_curl", math.inf),
+        ("step_length", math.nan),
+        ("tolerance", -0.1),
+        ("soft_determinant", -1.0),
+        ("min_determinant", 0.0),
+        ("min_determinant", 1.0),
+    ],
+)
+def test_settings_out_of_range_are_named(setting, value):
+    with pytest.raises(InputError, match=setting):
+        RegistrationSettings(**{setting: value})

@@ -1,0 +1,85 @@
+"""Coarse to fine: grids of one box Ω with fewer nodes, images smoothed onto them, displacements brought up again."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchdeform.grid import Grid
+
+# A level keeps at least this many nodes along an axis.
+MIN_NODES = 8
+
+# Standard deviation of the smoothing before a level, in voxels of that level.
+_BLUR = 0.5
+
+_INTERPOLATION = {2: "bilinear", 3: "trilinear"}
+_CONV = {2: F.conv2d, 3: F.conv3d}
+_REPLICATE = "replicate"
+
+
+def pyramid_grids(grid: Grid, levels: int) -> list[Grid]:
+    """Return the grids of the levels, coarse to fine, the last being ``grid``.
+
+    Args:
+        grid: the finest grid.
+        levels: number of levels wanted.
+
+    Returns:
+        Grids of the same box. Each level aims at twice the voxel size of the next, starting from the finest spacing, so
+        thick slices are thinned out last. Levels that equal the next one (all axes at 8 nodes) are left out.
+    """
+    finest = min(grid.spacing)
+    grids = [grid]
+    for level in range(1, levels):
+        target = finest * 2**level
+        shape = tuple(
+            n if h >= target else min(n, max(MIN_NODES, round(side / target) + 1))
+            for n, h, side in zip(grid.shape, grid.spacing, grid.extent, strict=True)
+        )
+        if shape != grids[0].shape:
+            spacing = tuple(side / (n - 1) for side, n in zip(grid.extent, shape, strict=True))
+            grids.insert(0, Grid(shape, spacing))
+    return grids
+
+
+def restrict(image: Tensor, grid: Grid, coarse: Grid) -> Tensor:
+    """Return the image on a coarser grid of the same box, smoothed first so that nothing aliases.
+
+    Args:
+        image: ``(B, C, *S)`` on ``grid``.
+        grid: its grid.
+        coarse: the grid wanted.
+    """
+    if coarse == grid:
+        return image
+    for axis, (h, wide) in enumerate(zip(grid.spacing, coarse.spacing, strict=True)):
+        if wide > h:
+            image = _gaussian(image, axis, _BLUR * wide / h)
+    return _resize(image, coarse)
+
+
+def prolong(u: Tensor, grid: Grid) -> Tensor:
+    """Return a displacement on a finer grid of the same box, by linear interpolation between its nodes.
+
+    Args:
+        u: ``(B, D, *S)`` in units of spacing.
+        grid: the grid wanted.
+    """
+    return u if tuple(u.shape[2:]) == grid.shape else _resize(u, grid)
+
+
+def _resize(field: Tensor, grid: Grid) -> Tensor:
+    return F.interpolate(field, size=grid.shape, mode=_INTERPOLATION[grid.dim], align_corners=True)
+
+
+def _gaussian(image: Tensor, axis: int, sigma: float) -> Tensor:
+    """Convolve along one axis with a Gaussian of ``sigma`` voxels, the image being continued by its boundary values."""
+    radius, dim = math.ceil(3 * sigma), image.dim() - 2
+    offset = torch.arange(-radius, radius + 1, dtype=image.dtype, device=image.device)
+    kernel = torch.exp(-(offset**2) / (2 * sigma**2))
+    kernel = (kernel / kernel.sum()).view(1, 1, *(-1 if a == axis else 1 for a in range(dim)))
+    padding = [radius if a == axis else 0 for a in reversed(range(dim)) for _ in range(2)]
+    flat = F.pad(image.flatten(0, 1).unsqueeze(1), padding, mode=_REPLICATE)
+    return _CONV[dim](flat, kernel).view(image.shape)

@@ -1,0 +1,85 @@
+"""What a registration returns, and what its callback sees on the way."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from torchdeform.diagnostics import Diagnosis
+from torchdeform.grid import Grid
+from torchdeform.registration.settings import RegistrationSettings
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One step of the optimisation, handed to the callback.
+
+    Attributes:
+        level: pyramid level, 0 is the coarsest.
+        levels: number of levels.
+        step: step within the level, from 1.
+        steps: steps at most on this level.
+        similarity: similarity of each item before the step ``(B,)``, higher is better.
+        shape: grid of this level.
+    """
+
+    level: int
+    levels: int
+    step: int
+    steps: int
+    similarity: Tensor
+    shape: tuple[int, ...]
+
+
+Callback = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class LevelRecord:
+    """How one pyramid level went.
+
+    Attributes:
+        shape: grid of the level.
+        similarity: similarity after each step, one ``(B,)`` tensor per step, the first before any step.
+        shortened: steps that were shortened because they would have folded, summed over the batch.
+        seconds: wall time.
+    """
+
+    shape: tuple[int, ...]
+    similarity: tuple[Tensor, ...]
+    shortened: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class RegistrationResult:
+    """The maps, the warped image, and how it went.
+
+    Attributes:
+        displacement: u of φ = id + u ``(B, D, *S)`` on the fixed grid, units of spacing, array-axis order. φ takes
+            points of the fixed space to the moving space; warped(x) = moving(φ(x)).
+        inverse: displacement of φ⁻¹ on the same grid; takes points of the moving space to the fixed space.
+        warped: moving image seen through φ ``(B, C, *S)``.
+        grid: the fixed grid.
+        similarity_before: similarity of fixed and moving ``(B,)``, higher is better.
+        similarity_after: similarity of fixed and warped ``(B,)``.
+        diagnosis: determinants and folds of φ.
+        inverse_error_mean: mean over x of |φ(φ⁻¹(x)) − x| in voxels ``(B,)``.
+        inverse_error_max: its maximum ``(B,)``.
+        levels: one record per pyramid level, coarse to fine.
+        seconds: wall time per stage.
+        settings: the settings used.
+    """
+
+    displacement: Tensor
+    inverse: Tensor
+    warped: Tensor
+    grid: Grid
+    similarity_before: Tensor
+    similarity_after: Tensor
+    diagnosis: Diagnosis
+    inverse_error_mean: Tensor
+    inverse_error_max: Tensor
+    levels: tuple[LevelRecord, ...]
+    seconds: dict[str, float]
+    settings: RegistrationSettings
