@@ -1,0 +1,66 @@
+"""Make the example pair from a picture that scikit-image bundles: the moving image is a strongly deformed copy.
+
+The picture is a fundus photograph of a normal left eye (Häggström 2014, public domain, `skimage.data.retina`).
+"""
+
+import math
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+from skimage.data import retina
+from skimage.transform import resize
+from torch import Tensor
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import torchdeform as td  # noqa: E402
+
+SIZE = 256
+TURN, SQUEEZE = 0.45, 0.035  # radians in the middle; share of the width
+
+
+def deformation(grid: td.Grid) -> Tensor:
+    """Return a displacement ``(1, 2, *S)`` that turns the middle and stretches around it; zero at the edge."""
+    unit = grid.points() / grid.along(grid.extent, grid.points())
+    y, x = unit[:, 0] - 0.5, unit[:, 1] - 0.5
+    bump = (torch.sin(math.pi * unit) ** 2).prod(dim=1)
+    angle = TURN * bump
+    turned = torch.stack((angle.cos() * y - angle.sin() * x - y, angle.sin() * y + angle.cos() * x - x), dim=1)
+    waves = torch.stack((torch.sin(3 * math.pi * (x + 0.5)), torch.sin(3 * math.pi * (y + 0.5))), dim=1)
+    return (turned + SQUEEZE * bump * waves) * grid.along(grid.extent, unit)
+
+
+def make_pair() -> None:
+    """Write ``examples/fixed.png`` and ``examples/moving.png``."""
+    picture = torch.from_numpy(resize(retina(), (SIZE, SIZE), anti_aliasing=True)).float().movedim(-1, 0).unsqueeze(0)
+    fixed = td.Image(picture * 255, td.Grid((SIZE, SIZE)), pixel_type="uint8")
+    u = deformation(fixed.grid)
+    darker = td.warp(picture, u, fixed.grid) ** 1.15 * 0.95  # as another camera might see it
+    moving = td.Image(darker * 255, fixed.grid, pixel_type="uint8")
+    td.write_image(fixed, ROOT / "examples" / "fixed.png")
+    td.write_image(moving, ROOT / "examples" / "moving.png")
+    diagnosis = td.diagnose(u, fixed.grid)
+    largest = u.norm(dim=1).max().item()
+    low, high = diagnosis.det_min.item(), diagnosis.det_max.item()
+    print(f"moves by up to {largest:.1f} pixels, determinant {low:.2f} to {high:.2f}")
+
+
+def make_picture() -> None:
+    """Register the pair and write ``examples/overview.jpg``, the picture of the README."""
+    from PIL import Image as Picture
+
+    from torchdeform.pair import register_files
+
+    with tempfile.TemporaryDirectory() as folder:
+        fixed, moving = (ROOT / "examples" / name for name in ("fixed.png", "moving.png"))
+        register_files(fixed, moving, Path(folder), td.load_settings())
+        picture = Picture.open(Path(folder) / "overview.png").convert("RGB")
+    picture.save(ROOT / "examples" / "overview.jpg", quality=82, optimize=True)
+
+
+if __name__ == "__main__":
+    make_pair()
+    make_picture()

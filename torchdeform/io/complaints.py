@@ -1,0 +1,121 @@
+"""What is wrong with a file that ITK would read without a word: it breaks off, or holds NaN where ITK says 0."""
+
+import gzip
+import math
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from torchdeform.errors import InputError, nearest_name
+from torchdeform.io.files import suffix
+
+BROKEN_OFF = "is damaged or incomplete; fetch or export it again"
+NOT_FINITE = "has pixels that are NaN or infinite; replace them first, for instance by 0"
+
+_Stream = BinaryIO | gzip.GzipFile
+_CHUNK = 1 << 22  # bytes read at once, a multiple of every pixel's size
+_FLOATS = {16: "f4", 64: "f8"}  # NIfTI's datatype codes
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where a NIfTI header keeps dim, datatype, bitpix and vox_offset, as (format, position)."""
+
+    dim: tuple[str, int]
+    datatype: tuple[str, int]
+    bitpix: tuple[str, int]
+    offset: tuple[str, int]
+
+
+# By the number that the header starts with, its length.
+_NIFTI = {
+    348: _Layout(("8h", 40), ("h", 70), ("h", 72), ("f", 108)),
+    540: _Layout(("8q", 16), ("h", 12), ("h", 14), ("q", 168)),
+}
+
+
+def require_sound(path: Path) -> None:
+    """Raise `InputError` unless ``path`` is a file that can be opened and that nothing is visibly wrong with."""
+    if not path.exists():
+        near = nearest_name(path.name, (p.name for p in path.parent.iterdir())) if path.parent.is_dir() else ""
+        raise InputError(f"{path} does not exist; check the name{near}")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; give an image file")
+    try:
+        complaint = _COMPLAINTS.get(suffix(path), _about_nothing)(path) if path.stat().st_size else BROKEN_OFF
+        path.open("rb").close()
+    except OSError as error:
+        raise InputError(f"{path} cannot be opened: {error.strerror}; check its permissions") from error
+    if complaint:
+        raise InputError(f"{path} {complaint}")
+
+
+def _about_nothing(_: Path) -> None:
+    return None
+
+
+def _about_jpeg(path: Path) -> str | None:
+    """The last scan (FF DA) must be followed by the end of the image (FF D9); neither occurs inside coded pixels."""
+    content = path.read_bytes()
+    return None if content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda") else BROKEN_OFF
+
+
+def _about_bmp(path: Path) -> str | None:
+    """The header tells the size of the file."""
+    with path.open("rb") as file:
+        head = file.read(6)
+    return None if int.from_bytes(head[2:], "little") <= path.stat().st_size else BROKEN_OFF
+
+
+def _about_nifti(path: Path) -> str | None:
+    try:
+        with path.open("rb") if suffix(path) == ".nii" else gzip.open(path) as file:
+            return _about_voxels(file)
+    except (EOFError, zlib.error, gzip.BadGzipFile):
+        return BROKEN_OFF
+
+
+def _about_voxels(file: _Stream) -> str | None:
+    """Read a NIfTI stream from header to end; what is no NIfTI is left to others to judge."""
+    head = file.read(540)
+    if len(head) < 348:
+        return BROKEN_OFF
+    for order in "<>":
+        layout = _NIFTI.get(struct.unpack_from(order + "i", head)[0])
+        if layout is not None:
+            return _about_body(file, head, order, layout)
+    return None
+
+
+def _about_body(file: _Stream, head: bytes, order: str, layout: _Layout) -> str | None:
+    rank, *sizes = _field(head, order, layout.dim)
+    voxels = math.prod(max(size, 1) for size in sizes[: min(max(rank, 0), 7)])
+    missing = voxels * _field(head, order, layout.bitpix)[0] // 8
+    kind = _FLOATS.get(_field(head, order, layout.datatype)[0])
+    file.seek(int(_field(head, order, layout.offset)[0]))
+    finite = True
+    while chunk := file.read(min(_CHUNK, missing)):
+        missing -= len(chunk)
+        if kind and len(chunk) % int(kind[1]) == 0:
+            finite = finite and bool(np.isfinite(np.frombuffer(chunk, order + kind)).all())
+    while file.read(_CHUNK):  # to the end, where a compressed file has its checksum
+        pass
+    return BROKEN_OFF if missing else None if finite else NOT_FINITE
+
+
+def _field(head: bytes, order: str, field: tuple[str, int]) -> tuple[int, ...]:
+    return struct.unpack_from(order + field[0], head, field[1])
+
+
+_COMPLAINTS: dict[str, Callable[[Path], str | None]] = {
+    ".jpg": _about_jpeg,
+    ".jpeg": _about_jpeg,
+    ".bmp": _about_bmp,
+    ".nii": _about_nifti,
+    ".nii.gz": _about_nifti,
+}

@@ -1,0 +1,152 @@
+"""Reading and writing images, their place in the world kept exactly."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchdeform.errors import InputError
+from torchdeform.grid import Grid
+from torchdeform.image import Image
+from torchdeform.io import itk
+from torchdeform.io.complaints import require_sound
+from torchdeform.io.files import staged, suffix
+
+
+@dataclass(frozen=True)
+class Format:
+    """What a file format can hold: pixel types, the widest last, and numbers of channels (any when empty)."""
+
+    types: tuple[str, ...]
+    channels: tuple[int, ...] = ()
+
+
+_EIGHT_BITS = Format(("uint8",), (1, 3))
+_TIFF = Format(("uint8", "uint16", "int16", "float32"))
+_VOLUME = Format(("float32",))
+
+FORMATS: dict[str, Format] = {
+    ".png": Format(("uint8", "uint16"), (1, 3, 4)),
+    ".jpg": _EIGHT_BITS,
+    ".jpeg": _EIGHT_BITS,
+    ".bmp": Format(("uint8",), (1, 3, 4)),
+    ".tif": _TIFF,
+    ".tiff": _TIFF,
+    ".nii": _VOLUME,
+    ".nii.gz": _VOLUME,
+    ".mha": _VOLUME,
+    ".mhd": _VOLUME,
+    ".nrrd": _VOLUME,
+    ".nhdr": _VOLUME,
+}
+
+# Pictures that ITK may refuse (grey with alpha, say) and scikit-image reads; ITK gives pictures like these spacing 1.
+_PLAIN_PICTURES = (".png", ".gif", ".webp")
+
+
+def read_image(path: str | os.PathLike[str]) -> Image:
+    """Read a 2D or 3D image of any format that ITK knows (PNG, JPEG, TIFF, BMP, NIfTI, MetaImage, NRRD, DICOM, ...).
+
+    Args:
+        path: the file.
+
+    Returns:
+        The image: float32 pixels, one channel or several, with origin, spacing and direction as ITK has them.
+
+    Raises:
+        InputError: the file is missing, a folder, empty, damaged, of a format unknown, a series, or complex;
+            or a NIfTI file with NaN or infinite voxels, which ITK would read as 0.
+
+    Notes:
+        An axis of a single sample is dropped, so a volume of one slice is a 2D image. It keeps its place when it
+        lies square to the world axis that is dropped; an oblique slice is taken in its own plane.
+    """
+    file = Path(path)
+    require_sound(file)
+    try:
+        return itk.to_image(itk.load(file), str(path))
+    except RuntimeError as error:
+        return _read_otherwise(file, itk.reason(error))
+
+
+def _read_otherwise(path: Path, reason: str) -> Image:
+    """Read a picture that ITK refuses with scikit-image, or say why the file cannot be read."""
+    if suffix(path) in _PLAIN_PICTURES:
+        from skimage.io import imread
+
+        try:
+            pixels = imread(path)
+        except (OSError, ValueError, SyntaxError, RuntimeError) as error:
+            raise InputError(f"{path} cannot be read as an image; it may be damaged: export it again") from error
+        return _picture(pixels[0] if len(pixels) == 1 else pixels, str(path))
+    if "orthonormal" in reason:
+        raise InputError(f"{path} has axes that are not at right angles; reslice it onto a rectangular grid first")
+    if "determine ImageIO" in reason:
+        raise InputError(f"{path} is no image of a known format; convert it to PNG, TIFF, NIfTI, MetaImage or NRRD")
+    raise InputError(f"{path} cannot be read ({reason}); export it again, or as another format")
+
+
+def _picture(values: NDArray[np.generic], name: str) -> Image:
+    """Return pixels (y, x) or (y, x, channels) as an image; grey with alpha becomes RGBA."""
+    pixels = values.reshape(*values.shape, 1) if values.ndim == 2 else values
+    if pixels.ndim != 3:
+        raise InputError(f"{name} is a series of {len(values)} pictures; save one of them and give that")
+    if pixels.shape[-1] == 2:
+        pixels = pixels[..., [0, 0, 0, 1]]
+    data = torch.from_numpy(np.moveaxis(pixels, -1, 0).astype(np.float32)).unsqueeze(0)
+    return Image(data, Grid(pixels.shape[:2]), name=name, pixel_type=values.dtype.name)
+
+
+def write_image(image: Image, path: str | os.PathLike[str]) -> None:
+    """Write an image where it lies in the world, in the format that the file's ending tells.
+
+    Args:
+        image: 2D or 3D; its ``pixel_type`` is kept in picture formats that can hold it (rounded and clamped for
+            integers), volume formats (NIfTI, MetaImage, NRRD) get float32.
+        path: the file; an existing one is replaced, missing folders are made.
+
+    Raises:
+        InputError: unknown ending, pixels that the format cannot hold, or a place that cannot be written.
+
+    Notes:
+        The file appears whole or not at all.
+    """
+    file = Path(path)
+    pixels = _stored(image, file)
+    with staged(file.parent) as folder:
+        itk.save(itk.from_values(pixels, image), folder / file.name)
+
+
+def _stored(image: Image, path: Path) -> NDArray[np.generic]:
+    """Return the pixels ``(C, *S)`` in the type to store, `InputError` where the format cannot hold them."""
+    ending = suffix(path)
+    if ending not in FORMATS:
+        raise InputError(f"{path} has no ending that can be written; use one of {', '.join(FORMATS)}")
+    if not can_hold(ending, image):
+        what = f"{image.grid.dim}D {image.pixel_type} images of {image.data.shape[1]} channels"
+        raise InputError(f"{path}: {ending} files cannot hold {what}; use .tif or .nii.gz")
+    types = FORMATS[ending].types
+    kind = np.dtype(image.pixel_type if image.pixel_type in types else types[-1])
+    values = image.data[0].detach().cpu().numpy()
+    if kind.kind == "f":
+        return values.astype(kind)
+    limits = np.iinfo(kind)
+    return np.rint(values).clip(limits.min, limits.max).astype(kind)
+
+
+def can_hold(ending: str, image: Image) -> bool:
+    """Return whether files of this ending can hold the image's dimension, channels and pixel type."""
+    form = FORMATS.get(ending)
+    if form is None or (form.channels and (image.grid.dim != 2 or image.data.shape[1] not in form.channels)):
+        return False
+    return image.pixel_type in form.types or form.types[-1] == "float32"
+
+
+def ending_like(path: Path, image: Image) -> str:
+    """Return the ending that stores ``image`` like the file ``path``, ``.nii.gz`` where that cannot hold it."""
+    ending = suffix(path)
+    endings = (ending, ".png") if ending in _PLAIN_PICTURES else (ending,)
+    return next((e for e in endings if can_hold(e, image)), ".nii.gz")

@@ -1,0 +1,153 @@
+"""Between tensors (array order z, y, x) and SimpleITK's images (x, y, z, LPS mm): the one place that turns them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchdeform.errors import InputError
+from torchdeform.grid import Grid
+from torchdeform.image import Image
+from torchdeform.io.complaints import BROKEN_OFF
+from torchdeform.io.files import native_stderr
+
+if TYPE_CHECKING:
+    import SimpleITK as sitk
+
+# What the libraries below ITK print, rather than raise, when a file breaks off.
+_BROKEN_OFF = ("TIFFReadDirectory", "TIFFFetchDirectory", "TIFFFillStrip", "not read completely")
+
+
+def load(path: Path) -> "sitk.Image":
+    """Read a file with SimpleITK, its fourth axis dropped if it holds one volume only.
+
+    Raises:
+        InputError: the file breaks off, or holds a series.
+        RuntimeError: ITK cannot read it, in ITK's own words; the caller may know another way.
+    """
+    import SimpleITK as sitk
+
+    reader = sitk.ImageFileReader()
+    reader.SetFileName(str(path))
+    with native_stderr() as printed, _no_warnings():
+        image = _execute(reader)
+    if any(sign in line for line in printed for sign in _BROKEN_OFF):
+        raise InputError(f"{path} {BROKEN_OFF}")
+    if isinstance(image, RuntimeError):
+        raise image
+    return image
+
+
+def _execute(reader: "sitk.ImageFileReader") -> "sitk.Image | RuntimeError":
+    """Read what the reader was set to, a series of one as its only volume; ITK's error is returned, not raised."""
+    try:
+        reader.ReadImageInformation()
+        size = reader.GetSize()
+        if max(size[3:], default=1) > 1:
+            one = "SimpleITK.ReadImage(file)[:, :, :, 0]"
+            raise InputError(
+                f"{reader.GetFileName()} is a series, of size {size}; save one volume, {one}, and give that"
+            )
+        reader.SetExtractSize([*size[:3], *[0] * len(size[3:])])
+        return reader.Execute()
+    except RuntimeError as error:
+        return error
+
+
+def save(image: "sitk.Image", path: Path) -> None:
+    """Write a file with SimpleITK, compressed where the format knows how, `InputError` if it cannot be written."""
+    import SimpleITK as sitk
+
+    try:
+        with native_stderr(), _no_warnings():
+            sitk.WriteImage(image, str(path), useCompression=True)
+    except RuntimeError as error:
+        raise InputError(f"{path.name} cannot be written: {reason(error)}; choose another format or place") from error
+
+
+def reason(error: RuntimeError) -> str:
+    """Return what ITK says in the last line of its message, without the addresses."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1].rpartition("): ")[2].removeprefix("sitk::ERROR: ").rstrip(". ")
+
+
+class _no_warnings:
+    """Keep ITK's own warnings off while the block runs."""
+
+    def __enter__(self) -> None:
+        import SimpleITK as sitk
+
+        self.before = sitk.ProcessObject.GetGlobalWarningDisplay()
+        sitk.ProcessObject.SetGlobalWarningDisplay(False)
+
+    def __exit__(self, *_: object) -> None:
+        import SimpleITK as sitk
+
+        sitk.ProcessObject.SetGlobalWarningDisplay(self.before)
+
+
+def to_image(itk: "sitk.Image", name: str) -> Image:
+    """Return a SimpleITK image as an `Image` with float32 pixels; axes of a single sample are dropped.
+
+    Notes:
+        A slice of a volume becomes a 2D image. It keeps its place when it lies square to the world axis that is
+        dropped; an oblique slice is taken in its own plane: x and y are then distances along its rows and columns.
+    """
+    import SimpleITK as sitk
+
+    values = sitk.GetArrayFromImage(itk)
+    if np.iscomplexobj(values):
+        raise InputError(f"{name} holds complex numbers; save their magnitude and give that")
+    origin, direction, spacing = _drop_single_axes(itk)
+    channels = itk.GetNumberOfComponentsPerPixel()
+    shape = tuple(n for n in reversed(itk.GetSize()) if n > 1)
+    if len(shape) < 2:
+        raise InputError(f"{name} has size {list(itk.GetSize())}; give an image with at least two axes")
+    data = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32).reshape(1, *shape, channels))
+    grid = Grid(shape, tuple(reversed(spacing)))
+    rows = tuple(tuple(map(float, row)) for row in direction)
+    return Image(data.movedim(-1, 1).contiguous(), grid, tuple(origin), rows, name, values.dtype.name)
+
+
+def _drop_single_axes(itk: "sitk.Image") -> tuple[list[float], NDArray[np.float64], list[float]]:
+    """Return origin, direction and spacing of the axes (x, y, z) that have more than one sample."""
+    dim = itk.GetDimension()
+    keep = [k for k in range(dim) if itk.GetSize()[k] > 1]
+    drop = [k for k in range(dim) if k not in keep]
+    origin, direction = np.array(itk.GetOrigin()), np.array(itk.GetDirection()).reshape(dim, dim)
+    columns = direction[:, keep]
+    if np.abs(columns[drop]).max(initial=0.0) < 1e-5:
+        return [float(origin[k]) for k in keep], columns[keep], [itk.GetSpacing()[k] for k in keep]
+    return list(map(float, columns.T @ origin)), np.eye(len(keep)), [itk.GetSpacing()[k] for k in keep]
+
+
+def from_values(values: NDArray[np.generic], place: Image) -> "sitk.Image":
+    """Return an array ``(C, *S)`` at the place of an `Image` as a SimpleITK image, a vector image when C > 1."""
+    import SimpleITK as sitk
+
+    vector = values.shape[0] > 1
+    itk = sitk.GetImageFromArray(np.ascontiguousarray(np.moveaxis(values, 0, -1) if vector else values[0]), vector)
+    itk.SetOrigin(place.origin)
+    itk.SetSpacing(place.grid.spacing[::-1])
+    itk.SetDirection([entry for row in place.direction for entry in row])
+    return itk
+
+
+def to_world_vectors(u: Tensor, place: Image) -> NDArray[np.float64]:
+    """Return u ``(1, D, *S)`` (array order, units of spacing) as ITK's vectors ``(D, *S)``: direction · (x, y, z)."""
+    vectors = u[0].detach().cpu().to(torch.float64).flip(0).numpy()
+    return np.einsum("ij,j...->i...", _matrix(place.direction), vectors)
+
+
+def to_grid_vectors(vectors: Tensor, place: Image) -> Tensor:
+    """Return ITK's vectors ``(1, D, *S)`` as u in array order and units of spacing, undoing `to_world_vectors`."""
+    inverse = torch.from_numpy(np.linalg.inv(_matrix(place.direction)))
+    return torch.einsum("ij,bj...->bi...", inverse, vectors.double()).flip(1).to(vectors.dtype)
+
+
+def _matrix(rows: Sequence[Sequence[float]]) -> NDArray[np.float64]:
+    return np.array(rows, dtype=np.float64)

@@ -1,0 +1,89 @@
+"""``result.json``: what was registered, how, and how it went."""
+
+import json
+import math
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from torchdeform import __version__
+from torchdeform.image import Image
+from torchdeform.registration.result import LevelRecord, RegistrationResult
+
+
+def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[str, object]:
+    """Return the record of one registered pair as plain numbers, strings, lists and mappings.
+
+    Args:
+        result: a result of one pair (batch of 1).
+        fixed: the fixed image as read.
+        moving: the moving image as read.
+
+    Returns:
+        A mapping that `write_json` can write; sizes are in x, y, z order as in ITK, errors in voxels.
+    """
+    diagnosis = result.diagnosis
+    return {
+        "fixed": _place(fixed),
+        "moving": _place(moving),
+        "similarity": result.settings.similarity,
+        "similarity_before": result.similarity_before.item(),
+        "similarity_after": result.similarity_after.item(),
+        "folds": int(diagnosis.folds.item()),
+        "determinant_min": diagnosis.det_min.item(),
+        "determinant_max": diagnosis.det_max.item(),
+        "determinant_log_std": diagnosis.det_log_std.item(),
+        "inverse_error_mean": result.inverse_error_mean.item(),
+        "inverse_error_max": result.inverse_error_max.item(),
+        "seconds": result.seconds,
+        "levels": [_level(level) for level in result.levels],
+        "device": device_name(result.displacement.device),
+        "settings": asdict(result.settings),
+        "versions": versions(),
+    }
+
+
+def _place(image: Image) -> dict[str, object]:
+    return {
+        "path": image.name,
+        "size": image.grid.shape[::-1],
+        "spacing": image.grid.spacing[::-1],
+        "origin": image.origin,
+        "channels": image.data.shape[1],
+        "pixel_type": image.pixel_type,
+    }
+
+
+def _level(level: LevelRecord) -> dict[str, object]:
+    return {
+        "size": level.shape[::-1],
+        "similarity": [value.item() for value in level.similarity],
+        "shortened": level.shortened,
+        "seconds": level.seconds,
+    }
+
+
+def device_name(device: torch.device) -> str:
+    """Return ``cpu`` or ``cuda``, the latter with the name of the card."""
+    return f"cuda ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else device.type
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a result depends on."""
+    return {"torchdeform": __version__, "torch": torch.__version__, "python": platform.python_version()}
+
+
+def write_json(record: Mapping[str, object], path: Path) -> None:
+    """Write a record as JSON that every reader takes: numbers that are not finite become null."""
+    path.write_text(json.dumps(_plain(record), indent=2, allow_nan=False, default=str) + "\n", encoding="utf-8")
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
