@@ -3,8 +3,15 @@
 The names below are loaded when they are first used, so ``import torchdeform`` costs little more than ``import torch``.
 """
 
+import os
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING
+
+# OpenMP's threads spin while they wait for each other. Where another program has one of the cores that made a
+# registration 25 times slower; after a short spin they sleep instead. Read once, when torch is loaded.
+if "torch" not in sys.modules:
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 # Not lazy: the module `warp` would hide the function of the same name as soon as anything imports it.
 from torchdeform.warp import compose, invert, warp

@@ -103,8 +103,8 @@ def test_similarity_never_falls_over_a_level():
 
 def test_a_batch_equals_its_items_one_by_one_with_a_hard_one_among_them():
     shape = (40, 48)
-    moving = blobs(shape, 3, items=3)
-    fixed = warp(moving, bend(Grid(shape), 2.0), Grid(shape))
+    moving = blobs(shape, 3, items=3).double()  # steps that are held back amplify rounding
+    fixed = warp(moving, bend(Grid(shape), 2.0).double(), Grid(shape))
     fixed[1] = blobs(shape, 9)[0]  # nothing in common
     fixed[2] = moving[2]  # nothing to do
     together = register(fixed, moving, QUICK)

@@ -6,7 +6,7 @@ from time import perf_counter
 import torch
 from torch import Tensor
 
-from torchdeform.diagnostics import Diagnosis, diagnose, inverse_error, one_sided_determinant, smallest_determinant
+from torchdeform.diagnostics import Diagnosis, diagnose, inverse_error, one_sided_determinant
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.fem.form import Form, Row, Term
 from torchdeform.fem.operator import assemble_load
@@ -201,7 +201,7 @@ def _run_level(
     best, values = u, []
     top = u.new_full((u.shape[0],), -torch.inf)
     active = torch.ones_like(top, dtype=torch.bool)
-    tops = []
+    tops, lowest = [], _lowest(u, level.grid)
     for step in range(steps + 1):
         warped = warp(level.moving, u, level.grid)
         value, gradient = level.similarity.evaluate(warped)
@@ -214,8 +214,9 @@ def _run_level(
         if step == steps or not bool(active.any()):
             break
         pace = settings.step_length * (1 - (1 - _LAST_STEP) * step / steps)
-        move = _move(level, u, warped, gradient, settings.soft_determinant) * _column(pace * active, u)
-        u, moved, short = _advance(u, move, level.grid, settings.min_determinant)
+        divergence = (settings.soft_determinant / lowest - 1).clamp_(min=0)
+        move = _move(level, warped, gradient, divergence) * _column(pace * active, u)
+        u, lowest, moved, short = _advance((u, lowest), move, level.grid, settings.min_determinant)
         active &= moved
         shortened += short
     return best, LevelRecord(level.grid.shape, tuple(values), shortened, perf_counter() - start)
@@ -228,7 +229,7 @@ def _stalled(tops: list[Tensor], tolerance: float) -> Tensor:
     return tops[-1] - tops[-1 - _PATIENCE] <= tolerance * (tops[-1] - tops[0])
 
 
-def _move(level: _Level, u: Tensor, warped: Tensor, gradient: Tensor, soft_determinant: float) -> Tensor:
+def _move(level: _Level, warped: Tensor, gradient: Tensor, divergence: Tensor) -> Tensor:
     """Return the velocity that least squares find for the force and the divergence, its longest move being one voxel.
 
     The force is scaled to 1 at its strongest, so the divergence needs no unit of similarity.
@@ -236,57 +237,66 @@ def _move(level: _Level, u: Tensor, warped: Tensor, gradient: Tensor, soft_deter
     grid = level.grid
     force = torch.cat([(gradient * derivative(warped, grid, a)).sum(1, keepdim=True) for a in range(grid.dim)], dim=1)
     tiny = torch.finfo(force.dtype).tiny
-    force = force / _column(force.norm(dim=1).flatten(1).amax(1).clamp(min=tiny), force)
-    lowest = one_sided_determinant(u, grid).clamp_(min=tiny)
-    divergence = (soft_determinant / lowest - 1).clamp_(min=0)
+    force = force / _column(force.square().sum(1).flatten(1).amax(1).sqrt().clamp(min=tiny), force)
     v = level.metric.solve(
         assemble_load(level.controls, torch.cat([divergence, force], dim=1), grid), power=level.power
     )
     return v / _column(max_voxels(v, grid).clamp(min=tiny), v)
 
 
-def _advance(u: Tensor, move: Tensor, grid: Grid, limit: float) -> tuple[Tensor, Tensor, int]:
-    """Return u ∘ flow(move), which items moved, and how often a step was halved.
+def _advance(
+    state: tuple[Tensor, Tensor], move: Tensor, grid: Grid, limit: float
+) -> tuple[Tensor, Tensor, Tensor, int]:
+    """Return u ∘ flow(move) and its `_lowest`, which items moved, and how often a step was halved.
 
     No determinant falls below ``limit``, or below the smallest one there was if that was less. Along the halvings the
     trial tends to u, so a bold step ends as a short one.
     """
-    floor = _smallest(u, grid).clamp(max=limit)
+    u, lowest = state
+    floor = lowest.flatten(1).amin(1).clamp(max=limit)
     fraction, halved = torch.ones_like(floor), 0
     while True:
         trial = compose(u, integrate(move * _column(fraction, u), grid, steps=1, method="midpoint"), grid)
-        low = ~(_smallest(trial, grid) >= floor)
+        trial_lowest = _lowest(trial, grid)
+        low = ~(trial_lowest.flatten(1).amin(1) >= floor)
         count = int(low.sum())
         if count == 0:
-            return trial, ~low, halved
+            return trial, trial_lowest, ~low, halved
         if bool((fraction[low] <= _SHORTEST).all()):
-            return torch.where(_column(low, u), u, trial), ~low, halved
+            (u, lowest) = _keep(~low, (trial, trial_lowest), state)
+            return u, lowest, ~low, halved
         halved += count
         fraction = torch.where(low, fraction / 2, fraction)
 
 
-def _smallest(u: Tensor, grid: Grid) -> Tensor:
-    """Return the smallest determinant of each item, one-sided or by `jacobian_determinant`.
+def _lowest(u: Tensor, grid: Grid) -> Tensor:
+    """Return at each node the smallest determinant ``(B, 1, *S)``, one-sided or by `jacobian_determinant`.
 
     Inside Ω the latter is a mean of one-sided ones. On the faces, where it extrapolates, it has to be looked at.
     """
-    faces = [u.narrow(a, start, 3) for a in grid.axes for start in (0, u.shape[a] - 3)]
-    on_faces = [jacobian_determinant(f, Grid(tuple(f.shape[2:]), grid.spacing)).flatten(1).amin(1) for f in faces]
-    return torch.stack([smallest_determinant(u, grid), *on_faces]).amin(0)
+    lowest = one_sided_determinant(u, grid)
+    for axis, n in zip(grid.axes, grid.shape, strict=True):
+        layers = torch.cat([u.narrow(axis, 0, 3), u.narrow(axis, n - 3, 3)])
+        first, last = jacobian_determinant(layers, Grid(tuple(layers.shape[2:]), grid.spacing)).chunk(2)
+        for node, det in ((0, first), (n - 1, last)):
+            face = lowest.select(axis, node)
+            torch.minimum(face, det.select(axis, 0 if node == 0 else 2), out=face)
+    return lowest
 
 
 def _unfold(u: Tensor, grid: Grid) -> Tensor:
     """Return u, drawn towards 0 until it does not fold: interpolation to a finer grid may, rarely, fold a map."""
-    while bool((low := ~(_smallest(u, grid) > 0)).any()):
+    while bool((low := ~(_lowest(u, grid).flatten(1).amin(1) > 0)).any()):
         u = torch.where(_column(low, u), 0.9 * u, u)
     return u
 
 
 def _keep(chosen: Tensor, new: tuple[Tensor, Tensor], old: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Return the new map and value for the chosen items, the old ones for the others."""
+    """Return both new tensors for the chosen items, the old ones for the others."""
     if bool(chosen.all()):
         return new
-    return torch.where(_column(chosen, new[0]), new[0], old[0]), torch.where(chosen, new[1], old[1])
+    first, second = (torch.where(_column(chosen, n), n, o) for n, o in zip(new, old, strict=True))
+    return first, second
 
 
 def _column(per_item: Tensor, like: Tensor) -> Tensor:
