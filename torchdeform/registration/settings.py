@@ -39,7 +39,7 @@ class RegistrationSettings:
     weight_curl: float = 1.0
     length: float = 12.0
     power: int = 1
-    steps: tuple[int, ...] = (100, 100, 100)
+    steps: tuple[int, ...] = (100, 100, 40)
     step_length: float = 0.5
     tolerance: float = 0.01
     soft_determinant: float = 0.15
