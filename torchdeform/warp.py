@@ -21,6 +21,9 @@ _POINTS_PER_THREAD = 2**13
 _SMALLEST_DETERMINANT = 0.01
 _SMALLEST_STEP = 2.0**-7
 
+# Steps for which the D² entries of ∇φ⁻¹, the dearest part of a step, are kept.
+_REFRESH = 3
+
 # How often nodes that Newton's method lost start again from their neighbours.
 _RESTARTS = 8
 
@@ -229,14 +232,16 @@ def _newton(u: Tensor, inverse: Tensor, w: Tensor, grid: Grid, atol: float, max_
 
     A step that brings a node no nearer is undone and halved; a node below atol, or halved too often, is left alone.
     """
-    defect = compose(u, w, grid)
+    defect, rows = compose(u, w, grid), inverse
     error = voxels(defect, grid)
     fraction = torch.ones_like(error)
-    for _ in range(max_steps):
+    for step in range(max_steps):
         active = (error > atol) & (fraction >= _SMALLEST_STEP)
         if not bool(active.any()):
             break
-        trial = w - fraction * _times(warp(inverse, w, grid), defect)
+        if step % _REFRESH == 0:
+            rows = warp(inverse, w, grid)
+        trial = w - fraction * _times(rows, defect)
         trial_defect = compose(u, trial, grid)
         trial_error = voxels(trial_defect, grid)
         nearer = active & (trial_error < error)
