@@ -268,7 +268,7 @@ def _draw_similarity(axes: "Axes", result: RegistrationResult, plane: Plane) -> 
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_box_aspect(plane.height_over_width)
     if result.levels:
-        axes.legend(fontsize=7, frameon=False, loc="lower right")
+        axes.legend(fontsize=7, frameon=False, loc="best")
 
 
 _PANELS: "dict[str, Draw]" = {
