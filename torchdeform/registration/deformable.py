@@ -1,5 +1,8 @@
 """Registration by flows: forces ask for divergence and curl, least squares give the velocity, its flow moves φ."""
 
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -27,6 +30,10 @@ _PATIENCE = 10
 
 # The step falls to this share of itself over a level.
 _LAST_STEP = 0.1
+
+# Fewer nodes than this are not worth more than one thread: with two threads beside another busy program, a pair of
+# 291×216 took twice as long as with one.
+_NODES_PER_THREAD = 2**16
 
 # Weight of the divergence that opens up nearly folded places, against a force of 1 at its strongest.
 _RESISTANCE = 3.0
@@ -152,8 +159,7 @@ def _optimise(
     settings: RegistrationSettings,
     callback: Callback | None,
 ) -> RegistrationResult:
-    """Run the levels on scaled images, then invert the map and judge it."""
-    start = perf_counter()
+    """Run the levels on scaled images."""
     grids = pyramid_grids(grid, len(settings.steps))
     steps = settings.steps[-len(grids) :]
     u = fixed.new_zeros(fixed.shape[0], grid.dim, *grids[0].shape)
@@ -161,8 +167,34 @@ def _optimise(
     for index, (coarse, count) in enumerate(zip(grids, steps, strict=True)):
         images = restrict(fixed, grid, coarse), restrict(moving, grid, coarse)
         level = _make_level(index, coarse, images, settings)
-        u, record = _run_level(level, _unfold(prolong(u, coarse), coarse), count, len(grids), settings, callback)
+        with _threads_worth(fixed.shape[0], coarse):
+            u, record = _run_level(level, _unfold(prolong(u, coarse), coarse), count, len(grids), settings, callback)
         records.append(record)
+    with _threads_worth(fixed.shape[0], grid):
+        return _finish((fixed, moving, original), u, grid, settings, records)
+
+
+@contextmanager
+def _threads_worth(items: int, grid: Grid) -> Iterator[None]:
+    """Use no more of torch's threads than the fields are worth: on a shared machine small ones wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(max(1, min(before, items * math.prod(grid.shape) // _NODES_PER_THREAD)))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _finish(
+    images: tuple[Tensor, Tensor, Tensor],
+    u: Tensor,
+    grid: Grid,
+    settings: RegistrationSettings,
+    records: list[LevelRecord],
+) -> RegistrationResult:
+    """Invert the map and judge it."""
+    fixed, moving, original = images
+    start = perf_counter()
     similarity = make_similarity(settings.similarity, fixed, settings.window)
     before, after = (similarity.evaluate(image)[0] for image in (moving, warp(moving, u, grid)))
     middle = perf_counter()
@@ -180,7 +212,11 @@ def _optimise(
         inverse_error_mean=mean,
         inverse_error_max=largest,
         levels=tuple(records),
-        seconds={"register": middle - start, "invert": inverted - middle, "diagnose": perf_counter() - inverted},
+        seconds={
+            "register": sum(record.seconds for record in records) + middle - start,
+            "invert": inverted - middle,
+            "diagnose": perf_counter() - inverted,
+        },
         settings=settings,
     )
 
