@@ -39,9 +39,9 @@ class RegistrationSettings:
     weight_curl: float = 1.0
     length: float = 12.0
     power: int = 1
-    steps: tuple[int, ...] = (100, 100, 40)
+    steps: tuple[int, ...] = (100, 100, 30)
     step_length: float = 0.5
-    tolerance: float = 0.01
+    tolerance: float = 0.02
     soft_determinant: float = 0.15
     min_determinant: float = 0.03
 
