@@ -18,6 +18,11 @@ from torchdeform.warp import compose, invert, warp
 
 if TYPE_CHECKING:
     from torchdeform.config import load_settings
+    from torchdeform.deformation.versions import (
+        grid_from_initial_monitor,
+        grid_from_target_monitor,
+        track_moving_monitor,
+    )
     from torchdeform.diagnostics import Diagnosis, diagnose
     from torchdeform.errors import ComputationError, InputError, TorchdeformError
     from torchdeform.fem import Weights, solve_div_curl
@@ -35,6 +40,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "config": ("load_settings",),
+    "deformation.versions": ("grid_from_initial_monitor", "grid_from_target_monitor", "track_moving_monitor"),
     "diagnostics": ("Diagnosis", "diagnose"),
     "errors": ("ComputationError", "InputError", "TorchdeformError"),
     "fem": ("Weights", "solve_div_curl"),
@@ -66,6 +72,8 @@ __all__ = [
     "curl",
     "diagnose",
     "divergence",
+    "grid_from_initial_monitor",
+    "grid_from_target_monitor",
     "integrate",
     "invert",
     "jacobian_determinant",
@@ -73,6 +81,7 @@ __all__ = [
     "read_image",
     "register",
     "solve_div_curl",
+    "track_moving_monitor",
     "warp",
     "write_image",
 ]

@@ -1,0 +1,1 @@
+"""The deformation method: maps with a given Jacobian determinant, as grids that follow a monitor function."""
