@@ -18,11 +18,15 @@ from torchdeform.warp import compose, invert, warp
 
 if TYPE_CHECKING:
     from torchdeform.config import load_settings
+    from torchdeform.deformation.averages import average_maps
+    from torchdeform.deformation.prescribed import from_jacobian_and_curl
+    from torchdeform.deformation.reconstruction import reconstruct
     from torchdeform.deformation.versions import (
         grid_from_initial_monitor,
         grid_from_target_monitor,
         track_moving_monitor,
     )
+    from torchdeform.deformation.volumes import simulate_volume_change
     from torchdeform.diagnostics import Diagnosis, diagnose
     from torchdeform.errors import ComputationError, InputError, TorchdeformError
     from torchdeform.fem import Weights, solve_div_curl
@@ -40,6 +44,10 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "config": ("load_settings",),
+    "deformation.averages": ("average_maps",),
+    "deformation.prescribed": ("from_jacobian_and_curl",),
+    "deformation.reconstruction": ("reconstruct",),
+    "deformation.volumes": ("simulate_volume_change",),
     "deformation.versions": ("grid_from_initial_monitor", "grid_from_target_monitor", "track_moving_monitor"),
     "diagnostics": ("Diagnosis", "diagnose"),
     "errors": ("ComputationError", "InputError", "TorchdeformError"),
@@ -68,10 +76,12 @@ __all__ = [
     "Status",
     "TorchdeformError",
     "Weights",
+    "average_maps",
     "compose",
     "curl",
     "diagnose",
     "divergence",
+    "from_jacobian_and_curl",
     "grid_from_initial_monitor",
     "grid_from_target_monitor",
     "integrate",
@@ -79,7 +89,9 @@ __all__ = [
     "jacobian_determinant",
     "load_settings",
     "read_image",
+    "reconstruct",
     "register",
+    "simulate_volume_change",
     "solve_div_curl",
     "track_moving_monitor",
     "warp",
