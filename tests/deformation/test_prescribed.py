@@ -304,6 +304,8 @@ ZERO = torch.zeros(1, 1, 5, 6)
         (ONE, ZERO, {"order": 3}, "order must be one of 2, 4"),
         (ONE, ZERO, {"boundary_displacement": ZERO}, "boundary_displacement must have shape"),
         (ONE, ZERO, {"start": ZERO}, "start must have shape"),
+        (ONE, ZERO, {"start": torch.zeros(2, 2, 5, 6)}, "start has 2 items, the data 1"),
+        (ONE, ZERO, {"start": torch.full((1, 2, 5, 6), math.nan)}, "start must be finite"),
         (ONE.expand(2, -1, -1, -1), ZERO.expand(3, -1, -1, -1), {}, r"batch sizes must agree or be 1, got \[2, 3\]"),
     ],
 )

@@ -165,7 +165,11 @@ class _Problem:
     def start(self, given: Tensor | None) -> Tensor:
         if given is not None:
             self.grid.check_vector(given, "from_jacobian_and_curl: start")
-            return self.complete(given.to(self.data).expand(self.data.shape[0], -1, *self.grid.shape))
+            if not bool(given.isfinite().all()):
+                raise InputError("from_jacobian_and_curl: start must be finite")
+            if given.shape[0] not in (1, len(self.data)):
+                raise InputError(f"from_jacobian_and_curl: start has {given.shape[0]} items, the data {len(self.data)}")
+            return self.complete(given.detach().to(self.data).expand(len(self.data), -1, *self.grid.shape))
         if self.values is None:
             return self.data.new_zeros(self.data.shape[0], self.grid.dim, *self.grid.shape)
         div, curl = self.data[:, :1] - 1, self.data[:, 1:]

@@ -161,27 +161,17 @@ class _Regions:
     def __init__(
         self, labels: Tensor, factors: Mapping[int, float], grid: Grid, rigid: Tensor | None, smoothing: float
     ) -> None:
-        where = "simulate_volume_change"
         like = labels if labels.dtype == torch.float64 else labels.to(torch.float32)
-        grid.check_scalar(like, f"{where}: labels")
-        if not factors or not all(math.isfinite(f) and f > 0 for f in factors.values()):
-            raise InputError(f"{where}: factors must be positive and finite, one or more, got {dict(factors)}")
+        grid.check_scalar(like, "simulate_volume_change: labels")
         self.grid, self.names, self.rigid = grid, list(factors), _checked_mask(rigid, labels, grid)
-        inside = torch.cat([labels == label for label in factors], dim=1)
-        for k, label in enumerate(factors):
-            if not bool(inside[:, k].flatten(1).any(1).all()):
-                raise InputError(f"{where}: label {label} does not occur; name labels that the image has")
-            if self.rigid is not None and bool((inside[:, k : k + 1] & self.rigid).any()):
-                raise InputError(f"{where}: label {label} lies in rigid_mask; what is rigid keeps its volume")
-        rest = ~inside.any(dim=1, keepdim=True)
-        rest = rest if self.rigid is None else rest & ~self.rigid
-        self.inside = torch.cat([inside, rest], dim=1).to(like.dtype)
+        self.inside = _indicators(labels, factors, self.rigid).to(like.dtype)
         self.smoothed = _shares(self.inside, grid, smoothing)
         self.before = self._sums(grid.quadrature(dtype=like.dtype, device=like.device))
-        share = like.new_tensor([*factors.values(), 1.0])
-        self.wanted = self._with_rest(self.before * share, self.before.sum(1))
+        self.wanted = self._with_rest(self.before * like.new_tensor([*factors.values(), 1.0]), self.before.sum(1))
         if not bool(((self.wanted > 0) & (self.before > 0)).all()):
-            raise InputError(f"{where}: the factors leave the rest of the domain no volume; name fewer or lower them")
+            raise InputError(
+                "simulate_volume_change: the factors leave the rest of the domain no volume; name fewer or lower them"
+            )
 
     def find_map(self, rtol: float, max_steps: int) -> VolumeChange:
         """Correct the amplitudes until the volumes are right."""
@@ -240,6 +230,21 @@ class _Regions:
         free = (~self.rigid).to(f.dtype)
         f = torch.where(self.rigid, 1.0, f * (mean_value(free, self.grid) / mean_value(f * free, self.grid)))
         return _flow_around(f, self.rigid, self.grid)
+
+
+def _indicators(labels: Tensor, factors: Mapping[int, float], rigid: Tensor | None) -> Tensor:
+    """Return the mask of each region, ``(B, R, *S)``, the last one the rest."""
+    where = "simulate_volume_change"
+    if not factors or not all(math.isfinite(f) and f > 0 for f in factors.values()):
+        raise InputError(f"{where}: factors must be positive and finite, one or more, got {dict(factors)}")
+    inside = torch.cat([labels == label for label in factors], dim=1)
+    rigid = torch.zeros_like(inside[:, :1]) if rigid is None else rigid
+    for label, region in zip(factors, inside.split(1, dim=1), strict=True):
+        if not bool(region.flatten(1).any(1).all()):
+            raise InputError(f"{where}: label {label} does not occur; name labels that the image has")
+        if bool((region & rigid).any()):
+            raise InputError(f"{where}: label {label} lies in rigid_mask; what is rigid keeps its volume")
+    return torch.cat([inside, ~(inside.any(dim=1, keepdim=True) | rigid)], dim=1)
 
 
 def _shares(inside: Tensor, grid: Grid, smoothing: float) -> Tensor:
