@@ -12,13 +12,13 @@ import sys
 from pathlib import Path
 
 import torch
-from drawing import draw_plane, new_figure, save
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torchdeform as td
 from torchdeform.deformation.monitors import MonitorSettings, ring_monitor
+from torchdeform.report.grids import write_grids
 
 NODES, STEPS = 64, 10
 STRETCH = (1.0, 1.6)
@@ -37,11 +37,8 @@ def main(picture: Path) -> None:
     grid = td.Grid((NODES, NODES), (1 / (NODES - 1),) * 2)
     u, nodes = given_map(grid), grid.points(dtype=torch.float64)
     solution = td.reconstruct(td.divergence(u, grid), td.curl(u, grid), grid, boundary_displacement=u, steps=STEPS)
-    figure = new_figure(12, 3)
-    panels = {"given": u} | {f"time step {t}": solution.trajectory[t - 1] for t in (STEPS // 2, STEPS)}
-    for axes, (title, moved) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
-        draw_plane(axes, nodes + moved, title)
-    save(figure, picture)
+    shown = {"given": u} | {f"time step {t}": solution.trajectory[t - 1] for t in (STEPS // 2, STEPS)}
+    write_grids(picture, {title: nodes + moved for title, moved in shown.items()})
     print(f"{float((solution.value - u).norm(dim=1).max()):.3e}")  # noqa: T201
 
 

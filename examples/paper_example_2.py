@@ -10,13 +10,13 @@ import sys
 from pathlib import Path
 
 import torch
-from drawing import draw_cutaway, new_figure, save
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torchdeform as td
 from torchdeform.deformation.monitors import MonitorSettings, ring_monitor
+from torchdeform.report.grids import write_grids
 
 NODES = 40
 
@@ -32,10 +32,7 @@ def main(picture: Path) -> None:
     grid = td.Grid((NODES,) * 3, (1 / (NODES - 1),) * 3)
     u, nodes = given_map(grid), grid.points(dtype=torch.float64)
     solution = td.reconstruct(td.divergence(u, grid), td.curl(u, grid), grid, boundary_displacement=u)
-    figure = new_figure(9, 4.6)
-    for place, (title, moved) in enumerate({"given": u, "reconstructed": solution.value}.items(), start=1):
-        draw_cutaway(figure.add_subplot(1, 2, place, projection="3d"), nodes + moved, title)
-    save(figure, picture)
+    write_grids(picture, {"given": nodes + u, "reconstructed": nodes + solution.value})
     print(f"{float((solution.value - u).norm(dim=1).max()):.3e}")  # noqa: T201
 
 

@@ -17,7 +17,7 @@ LAYERS = [
     ["deformation"],
     ["flow", "diagnostics"],
     ["fem", "solvers"],
-    ["transform", "warp", "stencil", "grid", "image"],
+    ["transform", "interpolation", "warp", "stencil", "grid", "image"],
     ["errors"],
 ]
 # Within a layer, what must not import what.

@@ -41,7 +41,7 @@ def test_commands_are_understood(root, monkeypatch):
     lines = [line for block in _blocks(root, "sh") for line in block.splitlines() if line.startswith("register ")]
     assert len(lines) >= 3
     seen = []
-    monkeypatch.setattr("torchdeform.cli.load_settings", lambda *arguments: seen.append(arguments))
+    monkeypatch.setattr("torchdeform.commands.register.load_settings", lambda *arguments: seen.append(arguments))
     for line in lines:
         assert main(shlex.split(line, comments=True)[1:]) in (1, 2)
     assert len(seen) == len(lines)

@@ -19,9 +19,23 @@ from torchdeform.warp import compose, invert, warp
 if TYPE_CHECKING:
     from torchdeform.config import load_settings
     from torchdeform.deformation.averages import average_maps
-    from torchdeform.deformation.prescribed import from_jacobian_and_curl
+    from torchdeform.deformation.monitors import (
+        MonitorSettings,
+        ball_monitor,
+        box_monitor,
+        curvature_monitor,
+        density_monitor,
+        gradient_monitor,
+        label_monitor,
+        line_monitor,
+        normalise_monitor,
+        ring_monitor,
+    )
+    from torchdeform.deformation.prescribed import NewtonSettings, from_jacobian_and_curl
     from torchdeform.deformation.reconstruction import reconstruct
+    from torchdeform.deformation.velocity import find_velocity
     from torchdeform.deformation.versions import (
+        DeformationSettings,
         grid_from_initial_monitor,
         grid_from_target_monitor,
         track_moving_monitor,
@@ -29,8 +43,8 @@ if TYPE_CHECKING:
     from torchdeform.deformation.volumes import simulate_volume_change
     from torchdeform.diagnostics import Diagnosis, diagnose
     from torchdeform.errors import ComputationError, InputError, TorchdeformError
-    from torchdeform.fem import Weights, solve_div_curl
-    from torchdeform.flow import integrate
+    from torchdeform.fem import SolverSettings, Weights, solve_div_curl
+    from torchdeform.flow import OdeSolver, integrate
     from torchdeform.grid import Grid
     from torchdeform.image import Image
     from torchdeform.io import read_image, write_image
@@ -45,14 +59,32 @@ __version__ = "0.1.0"
 _HOMES = {
     "config": ("load_settings",),
     "deformation.averages": ("average_maps",),
-    "deformation.prescribed": ("from_jacobian_and_curl",),
+    "deformation.monitors": (
+        "MonitorSettings",
+        "ball_monitor",
+        "box_monitor",
+        "curvature_monitor",
+        "density_monitor",
+        "gradient_monitor",
+        "label_monitor",
+        "line_monitor",
+        "normalise_monitor",
+        "ring_monitor",
+    ),
+    "deformation.prescribed": ("NewtonSettings", "from_jacobian_and_curl"),
     "deformation.reconstruction": ("reconstruct",),
     "deformation.volumes": ("simulate_volume_change",),
-    "deformation.versions": ("grid_from_initial_monitor", "grid_from_target_monitor", "track_moving_monitor"),
+    "deformation.velocity": ("find_velocity",),
+    "deformation.versions": (
+        "DeformationSettings",
+        "grid_from_initial_monitor",
+        "grid_from_target_monitor",
+        "track_moving_monitor",
+    ),
     "diagnostics": ("Diagnosis", "diagnose"),
     "errors": ("ComputationError", "InputError", "TorchdeformError"),
-    "fem": ("Weights", "solve_div_curl"),
-    "flow": ("integrate",),
+    "fem": ("SolverSettings", "Weights", "solve_div_curl"),
+    "flow": ("OdeSolver", "integrate"),
     "grid": ("Grid",),
     "image": ("Image",),
     "io": ("read_image", "write_image"),
@@ -66,31 +98,46 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "ComputationError",
+    "DeformationSettings",
     "Diagnosis",
     "Grid",
     "Image",
     "InputError",
+    "MonitorSettings",
+    "NewtonSettings",
+    "OdeSolver",
     "RegistrationResult",
     "RegistrationSettings",
     "Solution",
+    "SolverSettings",
     "Status",
     "TorchdeformError",
     "Weights",
     "average_maps",
+    "ball_monitor",
+    "box_monitor",
     "compose",
     "curl",
+    "curvature_monitor",
+    "density_monitor",
     "diagnose",
     "divergence",
+    "find_velocity",
     "from_jacobian_and_curl",
+    "gradient_monitor",
     "grid_from_initial_monitor",
     "grid_from_target_monitor",
     "integrate",
     "invert",
     "jacobian_determinant",
+    "label_monitor",
+    "line_monitor",
     "load_settings",
+    "normalise_monitor",
     "read_image",
     "reconstruct",
     "register",
+    "ring_monitor",
     "simulate_volume_change",
     "solve_div_curl",
     "track_moving_monitor",

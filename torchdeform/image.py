@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -132,6 +133,20 @@ def require_registrable(image: Image) -> None:
         raise InputError(f"{image.name} has pixels that are NaN or infinite; replace them first, for instance by 0")
     if bool((image.data == image.data.flatten(2)[:, :, 0].view(1, -1, *([1] * image.grid.dim))).all()):
         raise InputError(f"{image.name} is constant, so there is nothing to align; check that it is the right file")
+
+
+def require_same_place(image: Image, other: Image, *, atol: float = 1e-3) -> None:
+    """Raise `InputError` unless the nodes of both images are the same points of the world, to ``atol`` of a voxel."""
+    if image.grid.shape != other.grid.shape:
+        sizes = f"{'×'.join(map(str, image.grid.shape[::-1]))} and {'×'.join(map(str, other.grid.shape[::-1]))}"
+        raise InputError(f"{image.name} and {other.name} must lie on one grid, but have {sizes} nodes; resample one")
+    corners = torch.tensor(list(product(*((0.0, side) for side in image.grid.extent))), dtype=torch.float64).T[None]
+    apart = (image.to_world(corners) - other.to_world(corners)).norm(dim=1).max()
+    if float(apart) > atol * min(other.grid.spacing):
+        raise InputError(
+            f"{image.name} and {other.name} must lie in one place, but their headers put them {float(apart):.3g} mm "
+            "apart; correct origin, spacing or direction in one of them"
+        )
 
 
 def overlap(fixed: Image, moving: Image, *, samples: int = 32) -> float:
