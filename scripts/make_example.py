@@ -52,11 +52,11 @@ def make_picture() -> None:
     """Register the pair and write ``examples/overview.jpg``, the picture of the README."""
     from PIL import Image as Picture
 
-    from torchdeform.pair import register_files
+    from torchdeform.pair import PairFiles, register_files
 
     with tempfile.TemporaryDirectory() as folder:
         fixed, moving = (ROOT / "examples" / name for name in ("fixed.png", "moving.png"))
-        register_files(fixed, moving, Path(folder), td.load_settings())
+        register_files(PairFiles(fixed=fixed, moving=moving, out=Path(folder)), td.load_settings())
         picture = Picture.open(Path(folder) / "overview.png").convert("RGB")
     picture.save(ROOT / "examples" / "overview.jpg", quality=82, optimize=True)
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchdeform.diagnostics import diagnose
 from torchdeform.grid import Grid
 from torchdeform.image import Image, resample
+from torchdeform.registration.guidance import Guidance
 from torchdeform.registration.result import Callback, LevelRecord, Progress, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.warp import invert
@@ -78,9 +79,15 @@ def make_result() -> Callable[..., RegistrationResult]:
 
 
 def known_result(
-    fixed: Image, moving: Image, config: RegistrationSettings | None = None, *, callback: Callback | None = None
+    fixed: Image,
+    moving: Image,
+    config: RegistrationSettings | None = None,
+    *,
+    guidance: Guidance | None = None,
+    callback: Callback | None = None,
 ) -> RegistrationResult:
     """Answer like `torchdeform.register`, at once: the map is `smooth_displacement`, whatever the images."""
+    del guidance
     grid = fixed.grid
     u = smooth_displacement(grid)
     inverse = invert(u, grid)

@@ -47,12 +47,26 @@ if TYPE_CHECKING:
     from torchdeform.flow import OdeSolver, integrate
     from torchdeform.grid import Grid
     from torchdeform.image import Image
-    from torchdeform.io import read_image, write_image
+    from torchdeform.io import (
+        read_image,
+        read_labels,
+        read_points,
+        read_transform,
+        write_image,
+        write_labels,
+        write_points,
+        write_transform,
+    )
+    from torchdeform.registration.affine import Alignment, AlignmentSettings, align
     from torchdeform.registration.deformable import register
+    from torchdeform.registration.discrete import DiscreteSettings, discrete_start
+    from torchdeform.registration.evaluation import Evaluation, Measures, dice, hausdorff
+    from torchdeform.registration.guidance import Guidance
     from torchdeform.registration.result import RegistrationResult
     from torchdeform.registration.settings import RegistrationSettings
     from torchdeform.solvers.solution import Solution, Status
     from torchdeform.stencil import curl, divergence, jacobian_determinant
+    from torchdeform.transform import Affine, Displacement, Transform
 
 __version__ = "0.1.0"
 
@@ -87,22 +101,44 @@ _HOMES = {
     "flow": ("OdeSolver", "integrate"),
     "grid": ("Grid",),
     "image": ("Image",),
-    "io": ("read_image", "write_image"),
+    "io": (
+        "read_image",
+        "read_labels",
+        "read_points",
+        "read_transform",
+        "write_image",
+        "write_labels",
+        "write_points",
+        "write_transform",
+    ),
+    "registration.affine": ("Alignment", "AlignmentSettings", "align"),
+    "registration.discrete": ("DiscreteSettings", "discrete_start"),
+    "registration.evaluation": ("Evaluation", "Measures", "dice", "hausdorff"),
+    "registration.guidance": ("Guidance",),
     "registration.deformable": ("register",),
     "registration.result": ("RegistrationResult",),
     "registration.settings": ("RegistrationSettings",),
     "solvers.solution": ("Solution", "Status"),
+    "transform": ("Affine", "Displacement", "Transform"),
     "stencil": ("curl", "divergence", "jacobian_determinant"),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "Affine",
+    "Alignment",
+    "AlignmentSettings",
     "ComputationError",
     "DeformationSettings",
     "Diagnosis",
+    "DiscreteSettings",
+    "Displacement",
+    "Evaluation",
     "Grid",
+    "Guidance",
     "Image",
     "InputError",
+    "Measures",
     "MonitorSettings",
     "NewtonSettings",
     "OdeSolver",
@@ -112,7 +148,9 @@ __all__ = [
     "SolverSettings",
     "Status",
     "TorchdeformError",
+    "Transform",
     "Weights",
+    "align",
     "average_maps",
     "ball_monitor",
     "box_monitor",
@@ -121,12 +159,15 @@ __all__ = [
     "curvature_monitor",
     "density_monitor",
     "diagnose",
+    "dice",
+    "discrete_start",
     "divergence",
     "find_velocity",
     "from_jacobian_and_curl",
     "gradient_monitor",
     "grid_from_initial_monitor",
     "grid_from_target_monitor",
+    "hausdorff",
     "integrate",
     "invert",
     "jacobian_determinant",
@@ -135,6 +176,9 @@ __all__ = [
     "load_settings",
     "normalise_monitor",
     "read_image",
+    "read_labels",
+    "read_points",
+    "read_transform",
     "reconstruct",
     "register",
     "ring_monitor",
@@ -143,6 +187,9 @@ __all__ = [
     "track_moving_monitor",
     "warp",
     "write_image",
+    "write_labels",
+    "write_points",
+    "write_transform",
 ]
 
 

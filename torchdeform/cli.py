@@ -6,9 +6,11 @@ from collections.abc import Sequence
 
 import typer
 
+from torchdeform.commands.check import check
 from torchdeform.commands.deformation import adapt_grid, reconstruct, simulate
 from torchdeform.commands.options import Version
 from torchdeform.commands.register import register
+from torchdeform.commands.transforms import VERBS as TRANSFORM_VERBS
 from torchdeform.errors import ComputationError, InputError
 
 _TRACEBACK = "TORCHDEFORM_TRACEBACK"
@@ -16,6 +18,8 @@ _TRACEBACK = "TORCHDEFORM_TRACEBACK"
 # What `torchdeform` can do, by the name of the verb.
 VERBS = {
     "register": register,
+    "check": check,
+    **TRANSFORM_VERBS,
     "grid": adapt_grid,
     "reconstruct": reconstruct,
     "simulate": simulate,

@@ -1,34 +1,76 @@
 """One pair of image files, from reading to the folder of results."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from time import perf_counter
 
 import torch
 
+from torchdeform.check import WARNING, preflight
 from torchdeform.errors import ComputationError, InputError, require_choice
-from torchdeform.image import Image, luminance, overlap, require_registrable
+from torchdeform.image import Image
 from torchdeform.io import read_image, write_displacement, write_image, write_transform
 from torchdeform.io.files import require_writable, staged
 from torchdeform.io.images import ending_like
+from torchdeform.io.labels import read_labels, write_labels
+from torchdeform.io.points import matched, read_points
+from torchdeform.memory import available, estimate, fitting_grid, readable
+from torchdeform.registration.guidance import Guidance
+from torchdeform.registration.intensities import corresponding_channels
 from torchdeform.registration.result import Callback, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.overview import write_overview
 from torchdeform.report.record import describe, write_json
+from torchdeform.transform import Transform
 
 DEVICES = ("auto", "cpu", "cuda")
 RECORD = "result.json"
 
 
+@dataclass(frozen=True, kw_only=True)
+class PairFiles:
+    """The files of a pair.
+
+    Args:
+        fixed: image that stays.
+        moving: image that is warped onto it.
+        out: folder for the results; made if need be. Results of an earlier run are replaced, other files left alone.
+        fixed_mask: where the fixed image counts (not 0).
+        moving_mask: where the moving image counts (not 0).
+        fixed_points: landmarks of the fixed image, see `read_points`.
+        moving_points: the same landmarks in the moving image.
+        fixed_labels: regions of the fixed image, whole numbers.
+        moving_labels: the same regions of the moving image.
+    """
+
+    fixed: Path
+    moving: Path
+    out: Path
+    fixed_mask: Path | None = None
+    moving_mask: Path | None = None
+    fixed_points: Path | None = None
+    moving_points: Path | None = None
+    fixed_labels: Path | None = None
+    moving_labels: Path | None = None
+
+    def require_pairs(self) -> None:
+        """Raise `InputError` if points or labels are given for one image only."""
+        for what in ("points", "labels"):
+            given = [getattr(self, f"{side}_{what}") is not None for side in ("fixed", "moving")]
+            if given[0] != given[1]:
+                missing, other = ("moving", "fixed") if given[0] else ("fixed", "moving")
+                raise InputError(f"--{other}-{what} needs --{missing}-{what} too; give both or neither")
+
+
 @dataclass(frozen=True)
-class Pair:
-    """Two images to register and where they came from."""
+class Inputs:
+    """What was read: two images, what guides them, and what looks wrong with them."""
 
     fixed: Image
     moving: Image
-    fixed_path: Path
-    moving_path: Path
+    guidance: Guidance
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -41,6 +83,7 @@ class Outcome:
         folder: where the files are.
         files: their names.
         seconds: wall time per stage, reading and writing among them.
+        warnings: sentences about what looks wrong.
     """
 
     result: RegistrationResult
@@ -48,6 +91,7 @@ class Outcome:
     folder: Path
     files: tuple[str, ...]
     seconds: dict[str, float]
+    warnings: tuple[str, ...] = ()
 
 
 def choose_device(name: str) -> torch.device:
@@ -62,56 +106,111 @@ def choose_device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-def read_pair(fixed: Path, moving: Path) -> Pair:
-    """Read two images and check that they can be registered at all.
+def read_inputs(files: PairFiles, settings: RegistrationSettings) -> Inputs:
+    """Read all files of a pair and check that they can be registered at all.
 
     Raises:
-        InputError: either cannot be read, is constant or has NaN pixels; one is 2D and the other 3D; or they lie
-            apart in physical space.
+        InputError: a file cannot be read, or what `preflight` calls an error.
     """
-    pair = Pair(read_image(fixed), read_image(moving), fixed, moving)
-    for image in (pair.fixed, pair.moving):
-        require_registrable(luminance(image))
-    if overlap(pair.fixed, pair.moving) == 0.0:
-        raise InputError(
-            f"{fixed} and {moving} do not overlap in physical space; correct the origin in one of the headers, "
-            "or align the images first"
-        )
-    return pair
+    files.require_pairs()
+    fixed, moving = read_image(files.fixed), read_image(files.moving)
+    masks = [None if path is None else read_image(path) for path in (files.fixed_mask, files.moving_mask)]
+    report = preflight(
+        fixed,
+        moving,
+        fixed_mask=masks[0],
+        moving_mask=masks[1],
+        aligned=settings.align != "none",
+        settings=settings,
+    )
+    report.require_ok()
+    corresponding_channels(fixed, moving)
+    labels = [None if path is None else read_labels(path) for path in (files.fixed_labels, files.moving_labels)]
+    points = _read_points(files, fixed, moving)
+    guidance = Guidance(
+        fixed_mask=masks[0],
+        moving_mask=masks[1],
+        fixed_points=points[0],
+        moving_points=points[1],
+        fixed_labels=labels[0],
+        moving_labels=labels[1],
+    )
+    guidance.require_images(fixed.grid.dim)
+    return Inputs(fixed, moving, guidance, report.of(WARNING))
+
+
+def _read_points(
+    files: PairFiles, fixed: Image, moving: Image
+) -> tuple[torch.Tensor, torch.Tensor] | tuple[None, None]:
+    """Return corresponding landmarks in the world, ``(1, D, n)`` each."""
+    if files.fixed_points is None or files.moving_points is None:
+        return None, None
+    first, second, _ = matched(read_points(files.fixed_points, fixed), read_points(files.moving_points, moving))
+    return first.T.unsqueeze(0), second.T.unsqueeze(0)
 
 
 def register_files(
-    fixed: Path,
-    moving: Path,
-    out: Path,
+    files: PairFiles,
     settings: RegistrationSettings,
     *,
     device: str = "auto",
+    memory: int | None = None,
     callback: Callback | None = None,
 ) -> Outcome:
     """Register two image files and write the results into a folder.
 
     Args:
-        fixed: image that stays.
-        moving: image that is warped onto it.
-        out: folder for the results; made if need be. Results of an earlier run are replaced, other files left alone.
+        files: the pair and its folder of results.
         settings: how to register.
         device: ``auto``, ``cpu`` or ``cuda``.
+        memory: bytes to take at most; the finest level is coarsened to fit. What the machine has free when None, and
+            a pair that does not fit is refused.
         callback: is shown every step.
 
     Raises:
-        InputError: the files, the device or the folder will not do; found out before any long work.
+        InputError: the files, the device or the folder will not do, or memory does not suffice; found out before any
+            long work.
         ComputationError: the registration failed. Nothing is written then.
     """
     from torchdeform.registration.deformable import register
 
     where, start = choose_device(device), perf_counter()
-    require_writable(out)
-    pair = read_pair(fixed, moving)
+    require_writable(files.out)
+    inputs = read_inputs(files, settings)
+    work, notes = _fitted(inputs.fixed, settings, memory, where)
     read = perf_counter() - start
-    result = register(pair.fixed.to(where), pair.moving.to(where), settings, callback=callback)
+    result = register(
+        work.to(where), inputs.moving.to(where), settings, guidance=inputs.guidance.to(where), callback=callback
+    )
+    if work is not inputs.fixed:
+        from torchdeform.registration.refine import onto_grid
+
+        result = onto_grid(result, inputs.fixed.to(where), inputs.moving.to(where), inputs.guidance.to(where))
     _require_finite(result)
-    return _publish(pair, result, out, read)
+    return _publish(files, replace(inputs, warnings=(*inputs.warnings, *notes)), result, read)
+
+
+def _fitted(
+    fixed: Image, settings: RegistrationSettings, memory: int | None, device: torch.device
+) -> tuple[Image, tuple[str, ...]]:
+    """Return the fixed image on the finest grid that memory allows, and a sentence if that is a coarser one."""
+    how = {"channels": fixed.data.shape[1], "similarity": settings.similarity}
+    need, free = estimate(fixed.grid, **how), available(device)
+    if memory is None:
+        if free is not None and need > free:
+            raise InputError(
+                f"{fixed.name}: registering it takes about {readable(need)} of memory and {readable(free)} are free; "
+                f"use --memory {readable(free, spaced=False)} to register it on a coarser grid"
+            )
+        return fixed, ()
+    grid = fitting_grid(fixed.grid, memory, **how)
+    if grid == fixed.grid:
+        return fixed, ()
+    from torchdeform.registration.pyramid import restrict
+
+    sizes = " instead of ".join("×".join(map(str, g.shape[::-1])) for g in (grid, fixed.grid))
+    note = f"to stay below {readable(memory)} of memory the finest level has {sizes} nodes"
+    return replace(fixed, data=restrict(fixed.data, fixed.grid, grid), grid=grid), (note,)
 
 
 def _require_finite(result: RegistrationResult) -> None:
@@ -119,29 +218,48 @@ def _require_finite(result: RegistrationResult) -> None:
         raise ComputationError("the registration diverged: its map is not finite; try --preset default without --set")
 
 
-def _publish(pair: Pair, result: RegistrationResult, out: Path, read: float) -> Outcome:
-    """Write every file of a result into ``out``, all of them or none."""
+def _publish(files: PairFiles, inputs: Inputs, result: RegistrationResult, read: float) -> Outcome:
+    """Write every file of a result into the folder, all of them or none."""
+    out, start = files.out, perf_counter()
     former = _former_files(out)
-    start = perf_counter()
+    warnings = (*inputs.warnings, *(result.alignment.warnings if result.alignment else ()))
     with staged(out) as folder:
-        _write_images(folder, pair, result)
-        files = (*sorted(path.name for path in folder.iterdir()), RECORD)
+        _write_images(folder, files, inputs, result)
+        names = (*sorted(path.name for path in folder.iterdir()), RECORD)
         seconds = {"read": read, **result.seconds, "write": perf_counter() - start}
-        record = describe(result, pair.fixed, pair.moving) | {"seconds": seconds, "files": files}
+        record = describe(result, inputs.fixed, inputs.moving) | {
+            "inputs": {f.name: str(path) for f in fields(files) if (path := getattr(files, f.name)) is not None},
+            "warnings": warnings,
+            "seconds": seconds,
+            "files": names,
+        }
         write_json(record, folder / RECORD)
-    for name in former - set(files):
+    for name in former - set(names):
         (out / name).unlink(missing_ok=True)
-    return Outcome(result, record, out, files, seconds)
+    return Outcome(result, record, out, names, seconds, warnings)
 
 
-def _write_images(folder: Path, pair: Pair, result: RegistrationResult) -> None:
-    fixed = pair.fixed
-    warped = replace(fixed, data=result.warped, name="warped", pixel_type=pair.moving.pixel_type)
-    write_image(warped, folder / f"warped{ending_like(pair.moving_path, warped)}")
-    write_displacement(result.displacement, fixed, folder / "displacement.nii.gz")
-    write_transform(result.displacement, fixed, folder / "transform.h5")
-    write_transform(result.inverse, fixed, folder / "inverse.h5")
-    write_overview(folder / "overview.png", fixed, pair.moving, result)
+def _write_images(folder: Path, files: PairFiles, inputs: Inputs, result: RegistrationResult) -> None:
+    fixed, moving = inputs.fixed, inputs.moving
+    transform = Transform.from_displacement(
+        result.displacement.cpu(), fixed, inverse=result.inverse.cpu(), affine=result.affine, moving=moving
+    )
+    warped = replace(fixed, data=result.warped, name="warped", pixel_type=moving.pixel_type)
+    write_image(warped, folder / f"warped{ending_like(files.moving, warped)}")
+    write_displacement(transform.flatten(fixed).field.data, fixed, folder / "displacement.nii.gz")
+    write_transform(transform, folder / "transform.h5")
+    write_transform(transform.inverse(), folder / "inverse.h5")
+    if files.moving_labels is not None and isinstance(inputs.guidance.moving_labels, Image):
+        carried = transform.labels(inputs.guidance.moving_labels, fixed)
+        write_labels(carried, folder / f"warped_labels{ending_like(files.moving_labels, carried)}")
+    before = moving if result.affine is None else _through_affine(moving, fixed, result)
+    write_overview(folder / "overview.png", fixed, before, result)
+
+
+def _through_affine(moving: Image, fixed: Image, result: RegistrationResult) -> Image:
+    """Return the moving image as it lies on the fixed grid after alignment, which the picture starts from."""
+    aligned = Transform((result.affine,), fixed, moving) if result.affine is not None else None
+    return moving if aligned is None else aligned.image(moving, fixed)
 
 
 def _former_files(out: Path) -> set[str]:

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -11,14 +11,48 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from torchdeform.commands.options import Device, Out, Quiet, Version, table
 from torchdeform.config import load_settings, parse_override, preset_names
 from torchdeform.io.files import stem
-from torchdeform.pair import Outcome, register_files
+from torchdeform.memory import parse_size
+from torchdeform.pair import Outcome, PairFiles, register_files
 from torchdeform.registration.result import Progress as Step
+from torchdeform.registration.settings import ALIGNMENTS
 
 Fixed = Annotated[
     Path,
     typer.Argument(metavar="FIXED", help="Image that stays (PNG, JPEG, TIFF, BMP, NIfTI, MetaImage, NRRD; 2D or 3D)."),
 ]
 Moving = Annotated[Path, typer.Argument(metavar="MOVING", help="Image that is warped onto it.")]
+FixedMask = Annotated[
+    Path | None, typer.Option(metavar="FILE", show_default="none", help="Where FIXED counts (not 0).")
+]
+MovingMask = Annotated[
+    Path | None, typer.Option(metavar="FILE", show_default="none", help="Where MOVING counts (not 0).")
+]
+FixedPoints = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", show_default="none", help="Landmarks (csv, elastix txt, Slicer), measured ..."),
+]
+MovingPoints = Annotated[
+    Path | None, typer.Option(metavar="FILE", show_default="none", help="... and the same landmarks in MOVING.")
+]
+FixedLabels = Annotated[
+    Path | None, typer.Option(metavar="FILE", show_default="none", help="Regions, whose overlap is measured ...")
+]
+MovingLabels = Annotated[
+    Path | None, typer.Option(metavar="FILE", show_default="none", help="... and the same regions of MOVING.")
+]
+Align = Annotated[
+    str | None,
+    typer.Option(metavar="KIND", show_default="affine", help=f"Alignment that comes first: {', '.join(ALIGNMENTS)}."),
+]
+PointsWeight = Annotated[
+    float | None, typer.Option(metavar="W", show_default="0", help="Let the landmarks pull, with this weight.")
+]
+Symmetric = Annotated[
+    bool, typer.Option("--symmetric", metavar="", help="Prefer neither image: swapping them inverts the map.")
+]
+Memory = Annotated[
+    str | None, typer.Option(metavar="SIZE", show_default="what is free", help="Memory to take at most, such as 4GB.")
+]
 Preset = Annotated[str, typer.Option(metavar="NAME", help=f"Settings to start from: {', '.join(preset_names())}.")]
 Config = Annotated[
     Path | None, typer.Option(metavar="FILE", help="YAML file with settings that differ from the preset.")
@@ -32,35 +66,83 @@ def register(
     fixed: Fixed,
     moving: Moving,
     out: Out = None,
+    align: Align = None,
+    fixed_mask: FixedMask = None,
+    moving_mask: MovingMask = None,
+    fixed_points: FixedPoints = None,
+    moving_points: MovingPoints = None,
+    points_weight: PointsWeight = None,
+    fixed_labels: FixedLabels = None,
+    moving_labels: MovingLabels = None,
+    symmetric: Symmetric = False,
     preset: Preset = "default",
     config: Config = None,
     assignments: Assignments = None,
+    memory: Memory = None,
     device: Device = "auto",
     quiet: Quiet = False,
     version: Version = False,
 ) -> None:
-    """Warp MOVING onto FIXED by a map that does not fold.
+    """Warp MOVING onto FIXED: an alignment, then a map that does not fold.
 
     Writes warped.*, displacement.nii.gz, transform.h5, inverse.h5, result.json and overview.png, all or none.
+    transform.h5 takes points from FIXED to MOVING and brings the image MOVING onto FIXED; inverse.h5 the other way.
     """
-    settings = load_settings(preset, config, dict(map(parse_override, assignments or [])))
+    shortcuts = {"align": align, "points_weight": points_weight, "symmetric": symmetric or None}
+    overrides = {key: value for key, value in shortcuts.items() if value is not None}
+    settings = load_settings(preset, config, dict(map(parse_override, assignments or [])) | overrides)
+    files = PairFiles(
+        fixed=fixed,
+        moving=moving,
+        out=out or Path(stem(moving)),
+        fixed_mask=fixed_mask,
+        moving_mask=moving_mask,
+        fixed_points=fixed_points,
+        moving_points=moving_points,
+        fixed_labels=fixed_labels,
+        moving_labels=moving_labels,
+    )
+    limit = None if memory is None else parse_size(memory)
     with _Bar(quiet) as bar:
-        outcome = register_files(fixed, moving, out or Path(stem(moving)), settings, device=device, callback=bar.show)
+        outcome = register_files(files, settings, device=device, memory=limit, callback=bar.show)
     if not quiet:
+        for warning in outcome.warnings:
+            typer.echo(f"warning: {warning}", err=True)
         typer.echo(summary(outcome))
 
 
 def summary(outcome: Outcome) -> str:
-    """Return what a person wants to know of a registration, in five lines."""
+    """Return what a person wants to know of a registration, in a few lines."""
     r = outcome.record
     lines = {
-        f"similarity ({r['similarity']})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
+        f"similarity ({_name(r['similarity'])})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
         "folds": f"{r['folds']}, determinant {r['determinant_min']:.3g} to {r['determinant_max']:.3g}",
         "inverse error": f"{r['inverse_error_mean']:.2g} voxel on average, {r['inverse_error_max']:.2g} at most",
+        **_measured(r),
         "seconds": f"{sum(outcome.seconds.values()):.1f} on {r['device']}",
         "results": f"{outcome.folder}{os.sep} ({', '.join(outcome.files)})",
     }
     return table(lines)
+
+
+def _name(similarity: object) -> str:
+    return (
+        " + ".join(f"{w:g} {name}" for name, w in similarity.items())
+        if isinstance(similarity, dict)
+        else str(similarity)
+    )
+
+
+def _measured(record: dict[str, Any]) -> dict[str, str]:
+    """Return lines about labels and landmarks, where they were given."""
+    lines = {}
+    for key, name in (("dice_mean", "Dice"), ("landmark_error_mean", "landmark error")):
+        stages = [
+            stage for stage in ("before", "aligned", "after") if key in record.get("evaluation", {}).get(stage, {})
+        ]
+        if stages:
+            lines[name] = " -> ".join(f"{record['evaluation'][stage][key]:.4g}" for stage in stages)
+    return lines
 
 
 class _Bar:

@@ -12,9 +12,12 @@ from typing import BinaryIO
 import numpy as np
 
 from torchdeform.errors import InputError, nearest_name
-from torchdeform.io.files import suffix
+from torchdeform.io.files import beginning, suffix
+from torchdeform.io.headers import about_meta, about_nrrd
 
 BROKEN_OFF = "is damaged or incomplete; fetch or export it again"
+EMPTY = "is empty; fetch or export it again"
+NOT_SQUARE = "has axes that are not at right angles; reslice it onto a rectangular grid first"
 NOT_FINITE = "has pixels that are NaN or infinite; replace them first, for instance by 0"
 
 _Stream = BinaryIO | gzip.GzipFile
@@ -22,20 +25,39 @@ _CHUNK = 1 << 22  # bytes read at once, a multiple of every pixel's size
 _FLOATS = {16: "f4", 64: "f8"}  # NIfTI's datatype codes
 
 
+# What files begin with (or have at a position), and the ending that tells it.
+_KINDS = (
+    (0, b"NRRD", ".nrrd"),
+    (0, b"ObjectType", ".mha"),
+    (0, b"NDims", ".mha"),
+    (0, b"\x89PNG", ".png"),
+    (0, b"\xff\xd8\xff", ".jpg"),
+    (0, b"II*\0", ".tif"),
+    (0, b"MM\0*", ".tif"),
+    (0, b"GIF8", ".gif"),
+    (0, b"\x1f\x8b", ".gz"),
+    (128, b"DICM", ".dcm"),
+    (344, b"n+1\0", ".nii"),
+    (0, b"\x89HDF", ".h5"),
+)
+_ALIKE = {".mhd": ".mha", ".nhdr": ".nrrd", ".tiff": ".tif", ".jpeg": ".jpg"}
+
+
 @dataclass(frozen=True)
 class _Layout:
-    """Where a NIfTI header keeps dim, datatype, bitpix and vox_offset, as (format, position)."""
+    """Where a NIfTI header keeps dim, datatype, bitpix, pixdim and vox_offset, as (format, position)."""
 
     dim: tuple[str, int]
     datatype: tuple[str, int]
     bitpix: tuple[str, int]
+    pixdim: tuple[str, int]
     offset: tuple[str, int]
 
 
 # By the number that the header starts with, its length.
 _NIFTI = {
-    348: _Layout(("8h", 40), ("h", 70), ("h", 72), ("f", 108)),
-    540: _Layout(("8q", 16), ("h", 12), ("h", 14), ("q", 168)),
+    348: _Layout(("8h", 40), ("h", 70), ("h", 72), ("8f", 76), ("f", 108)),
+    540: _Layout(("8q", 16), ("h", 12), ("h", 14), ("8d", 104), ("q", 168)),
 }
 
 
@@ -46,13 +68,22 @@ def require_sound(path: Path) -> None:
         raise InputError(f"{path} does not exist; check the name{near}")
     if path.is_dir():
         raise InputError(f"{path} is a folder; give an image file")
+    if not path.is_file():
+        raise InputError(f"{path} is no file but a device or a pipe; give an image file")
     try:
-        complaint = _COMPLAINTS.get(suffix(path), _about_nothing)(path) if path.stat().st_size else BROKEN_OFF
+        complaint = _COMPLAINTS.get(suffix(path), _about_nothing)(path) if path.stat().st_size else EMPTY
         path.open("rb").close()
     except OSError as error:
         raise InputError(f"{path} cannot be opened: {error.strerror}; check its permissions") from error
     if complaint:
         raise InputError(f"{path} {complaint}")
+
+
+def other_kind(path: Path) -> str:
+    """Return the ending that fits what the file holds, or an empty string if that is not known or is what it has."""
+    head = beginning(path, 512)
+    kind = next((ending for start, magic, ending in _KINDS if head[start:].startswith(magic)), "")
+    return "" if suffix(path).endswith(kind) or kind == _ALIKE.get(suffix(path)) else kind
 
 
 def _about_nothing(_: Path) -> None:
@@ -67,16 +98,17 @@ def _about_jpeg(path: Path) -> str | None:
 
 def _about_bmp(path: Path) -> str | None:
     """The header tells the size of the file."""
-    with path.open("rb") as file:
-        head = file.read(6)
-    return None if int.from_bytes(head[2:], "little") <= path.stat().st_size else BROKEN_OFF
+    return None if int.from_bytes(beginning(path, 6)[2:], "little") <= path.stat().st_size else BROKEN_OFF
 
 
 def _about_nifti(path: Path) -> str | None:
     try:
         with path.open("rb") if suffix(path) == ".nii" else gzip.open(path) as file:
             return _about_voxels(file)
-    except (EOFError, zlib.error, gzip.BadGzipFile):
+    except gzip.BadGzipFile:
+        known = other_kind(path)
+        return f"is not compressed but a {known} file; rename it" if known else BROKEN_OFF
+    except (EOFError, zlib.error):
         return BROKEN_OFF
 
 
@@ -87,15 +119,26 @@ def _about_voxels(file: _Stream) -> str | None:
         return BROKEN_OFF
     for order in "<>":
         layout = _NIFTI.get(struct.unpack_from(order + "i", head)[0])
-        if layout is not None:
-            return _about_body(file, head, order, layout)
+        if layout is not None and len(head) >= layout.offset[1] + 8:
+            return _about_header(head, order, layout) or _about_body(file, head, order, layout)
     return None
+
+
+def _about_header(head: bytes, order: str, layout: _Layout) -> str | None:
+    """Sizes, spacings and the place of the voxels must be numbers that make sense; the library below mends them."""
+    rank, *sizes = _field(head, order, layout.dim)
+    if not 1 <= rank <= 7 or min(sizes[:rank]) < 1:
+        return f"has the size {sizes[: min(max(rank, 0), 7)]} in its header; mend the header"
+    spacing = [h for h, n in zip(_field(head, order, layout.pixdim)[1:4], sizes[: min(rank, 3)], strict=False) if n > 1]
+    if not all(math.isfinite(h) and h != 0 for h in spacing):
+        return f"has the spacing {spacing} in its header; mend the header"
+    offset = _field(head, order, layout.offset)[0]
+    return None if math.isfinite(offset) and offset >= 0 else BROKEN_OFF
 
 
 def _about_body(file: _Stream, head: bytes, order: str, layout: _Layout) -> str | None:
     rank, *sizes = _field(head, order, layout.dim)
-    voxels = math.prod(max(size, 1) for size in sizes[: min(max(rank, 0), 7)])
-    missing = voxels * _field(head, order, layout.bitpix)[0] // 8
+    missing = math.prod(sizes[:rank]) * _field(head, order, layout.bitpix)[0] // 8
     kind = _FLOATS.get(_field(head, order, layout.datatype)[0])
     file.seek(int(_field(head, order, layout.offset)[0]))
     finite = True
@@ -116,6 +159,10 @@ _COMPLAINTS: dict[str, Callable[[Path], str | None]] = {
     ".jpg": _about_jpeg,
     ".jpeg": _about_jpeg,
     ".bmp": _about_bmp,
+    ".mha": about_meta,
+    ".mhd": about_meta,
+    ".nrrd": about_nrrd,
+    ".nhdr": about_nrrd,
     ".nii": _about_nifti,
     ".nii.gz": _about_nifti,
 }

@@ -1,7 +1,11 @@
 """Reading and writing images, their place in the world kept exactly."""
 
+import gzip
 import os
-from dataclasses import dataclass
+import shutil
+import tempfile
+import zlib
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +15,10 @@ from numpy.typing import NDArray
 from torchdeform.errors import InputError
 from torchdeform.grid import Grid
 from torchdeform.image import Image
-from torchdeform.io import itk
-from torchdeform.io.complaints import require_sound
+from torchdeform.io import dicom, itk
+from torchdeform.io.complaints import BROKEN_OFF, NOT_SQUARE, other_kind, require_sound
 from torchdeform.io.files import staged, suffix
+from torchdeform.io.tiff import read_tiff, write_tiff
 
 
 @dataclass(frozen=True)
@@ -47,33 +52,72 @@ FORMATS: dict[str, Format] = {
 _PLAIN_PICTURES = (".png", ".gif", ".webp")
 
 
+# What ITK's readers say, each in its own words, of a file that breaks off.
+_SHORT = ("fread got only", "inflate", "Cannot read requested file", "unexpected end")
+
+# Types of volumes that TIFF holds with the distance of its pages.
+_PAGED = ("uint8", "uint16", "float32")
+
+
 def read_image(path: str | os.PathLike[str]) -> Image:
-    """Read a 2D or 3D image of any format that ITK knows (PNG, JPEG, TIFF, BMP, NIfTI, MetaImage, NRRD, DICOM, ...).
+    """Read a 2D or 3D image: DICOM, NIfTI, MetaImage, NRRD, PNG, JPEG, TIFF, BMP and what else ITK knows.
 
     Args:
-        path: the file.
+        path: the file, plain or packed with gzip; a folder with one DICOM series; or one of the files of a series.
 
     Returns:
-        The image: float32 pixels, one channel or several, with origin, spacing and direction as ITK has them.
+        The image: float32 pixels, one channel or several, with origin, spacing and direction (LPS mm) of the file.
 
     Raises:
-        InputError: the file is missing, a folder, empty, damaged, of a format unknown, a series, or complex;
-            or a NIfTI file with NaN or infinite voxels, which ITK would read as 0.
+        InputError: the file is missing, empty, damaged, of a format unknown, several volumes, or complex; a header
+            that makes no sense or axes that are not at right angles; a folder without DICOM files or with several
+            series; slices that are missing or doubled; or a NIfTI file with NaN or infinite voxels, which ITK would
+            read as 0.
 
     Notes:
         An axis of a single sample is dropped, so a volume of one slice is a 2D image. It keeps its place when it
         lies square to the world axis that is dropped; an oblique slice is taken in its own plane.
+        One DICOM file is its whole series where that is a volume of 8 slices or more, see `dicom.read_file`.
+        The pages of a TIFF are a volume.
     """
     file = Path(path)
+    if file.is_dir():
+        return dicom.read_folder(file)
     require_sound(file)
+    if dicom.is_dicom(file):
+        return dicom.read_file(file)
+    ending = suffix(file)
+    if ending.endswith(".gz") and ending not in FORMATS:
+        return _read_packed(file)
+    return read_tiff(file) if ending in (".tif", ".tiff") and not other_kind(file) else _read_by_itk(file)
+
+
+def _read_packed(path: Path) -> Image:
+    """Read a file that gzip packed, in a folder that is gone afterwards."""
+    with tempfile.TemporaryDirectory() as folder:
+        unpacked = Path(folder) / path.with_suffix("").name
+        try:
+            with gzip.open(path) as source, unpacked.open("wb") as target:
+                shutil.copyfileobj(source, target)
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+            raise InputError(f"{path} {BROKEN_OFF}") from error
+        try:
+            return replace(read_image(unpacked), name=str(path))
+        except InputError as error:
+            raise InputError(str(error).replace(str(unpacked), str(path))) from error
+
+
+def _read_by_itk(path: Path) -> Image:
     try:
-        return itk.to_image(itk.load(file), str(path))
+        return itk.to_image(itk.load(path), str(path))
     except RuntimeError as error:
-        return _read_otherwise(file, itk.reason(error))
+        return _read_otherwise(path, itk.reason(error))
 
 
 def _read_otherwise(path: Path, reason: str) -> Image:
     """Read a picture that ITK refuses with scikit-image, or say why the file cannot be read."""
+    if kind := other_kind(path):
+        raise InputError(f"{path} holds a {kind} file under another name; rename it so that it ends in {kind}")
     if suffix(path) in _PLAIN_PICTURES:
         from skimage.io import imread
 
@@ -83,7 +127,11 @@ def _read_otherwise(path: Path, reason: str) -> Image:
             raise InputError(f"{path} cannot be read as an image; it may be damaged: export it again") from error
         return _picture(pixels[0] if len(pixels) == 1 else pixels, str(path))
     if "orthonormal" in reason:
-        raise InputError(f"{path} has axes that are not at right angles; reslice it onto a rectangular grid first")
+        raise InputError(f"{path} {NOT_SQUARE}")
+    if any(sign in reason for sign in _SHORT):
+        raise InputError(f"{path} {BROKEN_OFF}")
+    if "allocate memory" in reason:
+        raise InputError(f"{path} says that it is larger than the memory here; if it is not, its header is damaged")
     if "determine ImageIO" in reason:
         raise InputError(f"{path} is no image of a known format; convert it to PNG, TIFF, NIfTI, MetaImage or NRRD")
     raise InputError(f"{path} cannot be read ({reason}); export it again, or as another format")
@@ -115,9 +163,12 @@ def write_image(image: Image, path: str | os.PathLike[str]) -> None:
         The file appears whole or not at all.
     """
     file = Path(path)
-    pixels = _stored(image, file)
+    pixels, paged = _stored(image, file), suffix(file) in (".tif", ".tiff") and image.grid.dim == 3
     with staged(file.parent) as folder:
-        itk.save(itk.from_values(pixels, image), folder / file.name)
+        if paged and pixels.dtype.name in _PAGED:
+            write_tiff(pixels, image.grid.spacing, folder / file.name)
+        else:
+            itk.save(itk.from_values(pixels, image), folder / file.name)
 
 
 def _stored(image: Image, path: Path) -> NDArray[np.generic]:

@@ -1,8 +1,9 @@
 """Between tensors (array order z, y, x) and SimpleITK's images (x, y, z, LPS mm): the one place that turns them."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 from torchdeform.errors import InputError
 from torchdeform.grid import Grid
 from torchdeform.image import Image
-from torchdeform.io.complaints import BROKEN_OFF
+from torchdeform.io.complaints import BROKEN_OFF, NOT_SQUARE
 from torchdeform.io.files import native_stderr
 
 if TYPE_CHECKING:
@@ -20,6 +21,11 @@ if TYPE_CHECKING:
 
 # What the libraries below ITK print, rather than raise, when a file breaks off.
 _BROKEN_OFF = ("TIFFReadDirectory", "TIFFFetchDirectory", "TIFFFillStrip", "not read completely")
+
+# The columns of a direction matrix may deviate from unit length and right angles by this much.
+_SQUARE = 1e-3
+
+_Result = TypeVar("_Result")
 
 
 def load(path: Path) -> "sitk.Image":
@@ -42,20 +48,37 @@ def load(path: Path) -> "sitk.Image":
     return image
 
 
+def values(path: Path) -> NDArray[np.generic]:
+    """Return the pixels of a file as SimpleITK has them, channels last; raises like `load`."""
+    import SimpleITK as sitk
+
+    return sitk.GetArrayFromImage(load(path))
+
+
 def _execute(reader: "sitk.ImageFileReader") -> "sitk.Image | RuntimeError":
     """Read what the reader was set to, a series of one as its only volume; ITK's error is returned, not raised."""
     try:
         reader.ReadImageInformation()
         size = reader.GetSize()
         if max(size[3:], default=1) > 1:
-            one = "SimpleITK.ReadImage(file)[:, :, :, 0]"
+            file, frame = reader.GetFileName(), "[:, :, :, 0]" if len(size) == 4 else "[:, :, :, 0, 0]"
             raise InputError(
-                f"{reader.GetFileName()} is a series, of size {size}; save one volume, {one}, and give that"
+                f"{file} is a series of {math.prod(size[3:])} volumes, size {size}; take one out and give that: "
+                f'SimpleITK.WriteImage(SimpleITK.ReadImage("{file}"){frame}, "frame.nii.gz")'
             )
         reader.SetExtractSize([*size[:3], *[0] * len(size[3:])])
         return reader.Execute()
     except RuntimeError as error:
         return error
+
+
+def quietly(work: Callable[[], _Result]) -> "_Result | RuntimeError":
+    """Return what ``work`` returns, or the error that it raises, with ITK's chatter kept off the terminal."""
+    with native_stderr(), _no_warnings():
+        try:
+            return work()
+        except RuntimeError as error:
+            return error
 
 
 def save(image: "sitk.Image", path: Path) -> None:
@@ -102,6 +125,7 @@ def to_image(itk: "sitk.Image", name: str) -> Image:
     values = sitk.GetArrayFromImage(itk)
     if np.iscomplexobj(values):
         raise InputError(f"{name} holds complex numbers; save their magnitude and give that")
+    _require_square(itk, name)
     origin, direction, spacing = _drop_single_axes(itk)
     channels = itk.GetNumberOfComponentsPerPixel()
     shape = tuple(n for n in reversed(itk.GetSize()) if n > 1)
@@ -111,6 +135,13 @@ def to_image(itk: "sitk.Image", name: str) -> Image:
     grid = Grid(shape, tuple(reversed(spacing)))
     rows = tuple(tuple(map(float, row)) for row in direction)
     return Image(data.movedim(-1, 1).contiguous(), grid, tuple(origin), rows, name, values.dtype.name)
+
+
+def _require_square(itk: "sitk.Image", name: str) -> None:
+    """Raise `InputError` unless the axes are at right angles: MetaImage and NRRD may hold anything."""
+    axes = np.array(itk.GetDirection()).reshape(itk.GetDimension(), -1)
+    if np.abs(axes.T @ axes - np.eye(len(axes))).max() > _SQUARE:
+        raise InputError(f"{name} {NOT_SQUARE}")
 
 
 def _drop_single_axes(itk: "sitk.Image") -> tuple[list[float], NDArray[np.float64], list[float]]:

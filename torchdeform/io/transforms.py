@@ -1,20 +1,38 @@
 """Displacement fields and transforms on disk as ITK reads them: LPS millimetres, x, y, z, points fixed -> moving."""
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from torchdeform.errors import InputError
 from torchdeform.image import Image
 from torchdeform.io import itk
 from torchdeform.io.complaints import require_sound
-from torchdeform.io.files import native_stderr, staged
+from torchdeform.io.files import native_stderr, staged, suffix
+from torchdeform.transform import Affine, Displacement, Stage, Transform
+
+if TYPE_CHECKING:
+    import SimpleITK as sitk
+
+_Path = str | os.PathLike[str]
+
+# Endings by what the files hold.
+COMPOSITES = (".h5", ".hdf5")
+AFFINES = (".tfm", ".txt", ".mat")
+FIELDS = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd")
+
+# A linear map is read off at steps this long, so that offsets of metres cost its matrix no digits.
+_STEP = 1024.0
 
 
-def write_displacement(u: Tensor, fixed: Image, path: str | os.PathLike[str]) -> None:
+def write_displacement(u: Tensor, fixed: Image, path: _Path) -> None:
     """Write u as an ITK displacement field: a vector image on the fixed grid, direction · (u_x, u_y, u_z) in mm.
 
     Args:
@@ -35,7 +53,7 @@ def write_displacement(u: Tensor, fixed: Image, path: str | os.PathLike[str]) ->
         itk.save(itk.from_values(field, fixed), folder / file.name)
 
 
-def read_displacement(path: str | os.PathLike[str]) -> Image:
+def read_displacement(path: _Path) -> Image:
     """Read an ITK displacement field; the inverse of `write_displacement`.
 
     Returns:
@@ -47,46 +65,189 @@ def read_displacement(path: str | os.PathLike[str]) -> Image:
     file = Path(path)
     require_sound(file)
     try:
-        field = itk.to_image(itk.load(file), str(path))
+        return _to_field(itk.to_image(itk.load(file), str(path)))
     except RuntimeError as error:
         raise InputError(f"{path} cannot be read ({itk.reason(error)}); it may be damaged: write it again") from error
-    if field.data.shape[1] != field.grid.dim:
-        parts = f"{field.data.shape[1]} components on a {field.grid.dim}D grid"
-        raise InputError(
-            f"{path} has {parts}, so it is no displacement field; give a vector image like displacement.nii.gz"
-        )
-    return replace(field, data=itk.to_grid_vectors(field.data, field))
 
 
-def write_transform(u: Tensor, fixed: Image, path: str | os.PathLike[str]) -> None:
-    """Write φ = id + u as an ITK composite transform, x -> x + u(x) in LPS mm.
+@overload
+def write_transform(transform: Transform, path: _Path, /) -> None: ...
+@overload
+def write_transform(transform: Tensor, fixed: Image, path: _Path, /) -> None: ...
+def write_transform(transform: Transform | Tensor, *where: Any) -> None:
+    """Write a transform as ITK has it, in the form that the file's ending tells; points go from fixed to moving.
 
     Args:
-        u: displacement ``(1, D, *S)`` on the fixed grid, array order, units of spacing.
-        fixed: the image whose grid it lives on.
-        path: the file, ``.h5`` (or ``.tfm``); replaced whole.
+        transform: the chain; or a displacement u ``(1, D, *S)`` (array order, units of spacing), followed by the fixed
+            image whose grid it lives on, for φ = id + u.
+        where: the file, replaced whole: ``.h5`` keeps every stage (ITK composite, float64); ``.tfm``, ``.txt`` and
+            ``.mat`` hold affine maps only, joined into one; ``.nii.gz``, ``.mha`` and ``.nrrd`` hold the whole chain as
+            one displacement field on its `reference` (float32).
 
     Raises:
-        InputError: shape, more than one item, or a place that cannot be written.
+        InputError: shape, an ending that cannot hold the transform, or a place that cannot be written.
 
     Notes:
         `SimpleITK.ReadTransform`, ANTs and 3D Slicer read it. It takes points of the fixed space to the moving
-        space, which is what a resampler needs to bring the moving image onto the fixed one. float64.
+        space, which is what a resampler needs to bring the moving image onto the fixed one.
     """
+    *fixed, path = where
+    if isinstance(transform, Tensor):
+        _check_field(transform, fixed[0], "write_transform: u")
+        transform = Transform.from_displacement(transform, fixed[0])
+    file = Path(path)
+    require_transform_file(file, transform)
+    if suffix(file) in FIELDS:
+        whole = transform.flatten().field
+        write_displacement(whole.data, whole, file)
+    elif suffix(file) in COMPOSITES:
+        _save(_composite(transform), file)
+    else:
+        _save(_affine(reduce(Affine.then, (s for s in transform.stages if isinstance(s, Affine)))), file)
+
+
+def require_transform_file(path: Path, transform: Transform | None = None) -> None:
+    """Raise `InputError` unless files of this ending hold transforms, and this one if it is given."""
+    ending = suffix(path)
+    if ending not in (*COMPOSITES, *AFFINES, *FIELDS):
+        known = ", ".join((*COMPOSITES, *AFFINES, *FIELDS))
+        raise InputError(f"{path} has no ending that transforms are written with ({known}); use the ending .h5")
+    if transform is None:
+        return
+    if ending in AFFINES and not all(isinstance(stage, Affine) for stage in transform.stages):
+        raise InputError(f"{path}: {ending} files hold affine maps only, and this has a displacement; use .h5")
+    if ending in FIELDS and transform.reference is None:
+        raise InputError(f"{path}: a displacement field needs a grid; give the fixed image as reference, or use .h5")
+
+
+def read_transform(path: _Path) -> Transform:
+    """Read a transform of ITK, ANTs or this library: its points go from fixed to moving, images the other way.
+
+    Args:
+        path: a transform file (``.h5``, ``.tfm``, ``.txt``, ``.mat``, ANTs' ``0GenericAffine.mat`` among them) with
+            linear maps of any kind, displacement fields, or composites of them; or a displacement field as an image
+            (``.nii.gz``, ``.mha``, ``.nrrd``, ANTs' ``1Warp.nii.gz`` among them).
+
+    Returns:
+        The transform, float64; its `reference` is the grid of a displacement that comes first.
+
+    Raises:
+        InputError: the file is missing, damaged, of another kind, or holds a transform that is neither linear nor a
+            displacement field (a B-spline, say).
+    """
+    file = Path(path)
+    require_sound(file)
+    if suffix(file) in FIELDS:
+        return Transform((Displacement(_double(read_displacement(file))),))
+    return Transform(tuple(_stages(_load(file), str(path))))
+
+
+def _load(path: Path) -> "sitk.Transform":
     import SimpleITK as sitk
 
-    file = Path(path)
-    field = sitk.DisplacementFieldTransform(itk.from_values(_world_field(u, fixed, "write_transform: u"), fixed))
-    with staged(file.parent) as folder:
+    try:
+        with native_stderr() as printed:
+            transform = sitk.ReadTransform(str(path))
+    except RuntimeError as error:
+        hint = f"give an ITK transform ({', '.join((*COMPOSITES, *AFFINES))}) or a displacement field"
+        raise InputError(f"{path} cannot be read as a transform; {hint}") from error
+    if any("more than one transform" in line for line in printed):
+        raise InputError(f"{path} holds several transforms side by side; write them as one composite, .h5")
+    if transform.GetDimension() not in (2, 3):
+        raise InputError(f"{path} is a transform of {transform.GetDimension()}D; give one of 2D or 3D")
+    return transform
+
+
+def _stages(transform: "sitk.Transform", name: str) -> list[Stage]:
+    """Return the stages of ITK's transform, what points meet first coming first: ITK keeps them the other way round."""
+    import SimpleITK as sitk
+
+    if transform.IsLinear():  # composites of linear maps too
+        return [_linear(transform, name)]
+    transform = transform.Downcast()
+    if isinstance(transform, sitk.CompositeTransform):
+        parts = [transform.GetNthTransform(k) for k in reversed(range(transform.GetNumberOfTransforms()))]
+        return [stage for part in parts for stage in _stages(part, name)]
+    if isinstance(transform, sitk.DisplacementFieldTransform):
+        return [Displacement(_field_of(transform.GetDisplacementField(), name))]
+    raise InputError(f"{name} holds a {transform.GetName()}, which is not read here; turn it into a displacement field")
+
+
+def _linear(transform: "sitk.Transform", name: str) -> Affine:
+    """Return a linear map of any kind, read off where it takes the origin and one point on each axis."""
+    dim = transform.GetDimension()
+    ends = [transform.TransformPoint([_STEP * (k == axis) for k in range(dim)]) for axis in range(-1, dim)]
+    offset, *columns = torch.tensor(ends, dtype=torch.float64)
+    try:
+        return Affine((torch.stack(columns, dim=1) - offset.unsqueeze(1)) / _STEP, offset)
+    except InputError as error:
+        raise InputError(f"{name} cannot be used: {error}; make it again") from error
+
+
+def _field_of(field: "sitk.Image", name: str) -> Image:
+    """Return a displacement field with its vectors in float64, as composite files hold them."""
+    import SimpleITK as sitk
+
+    image = itk.to_image(field, name)
+    values = torch.from_numpy(sitk.GetArrayFromImage(field)).double()
+    data = values.view(1, *image.grid.shape, -1).movedim(-1, 1).contiguous()
+    return _to_field(replace(image, data=data))
+
+
+def _to_field(vectors: Image) -> Image:
+    """Return ITK's vectors as u in array order and units of spacing."""
+    if vectors.data.shape[1] != vectors.grid.dim:
+        parts = f"{vectors.data.shape[1]} components on a {vectors.grid.dim}D grid"
+        hint = "give a vector image like displacement.nii.gz"
+        raise InputError(f"{vectors.name} has {parts}, so it is no displacement field; {hint}")
+    return replace(vectors, data=itk.to_grid_vectors(vectors.data, vectors))
+
+
+def _double(field: Image) -> Image:
+    return replace(field, data=field.data.double())
+
+
+def _composite(transform: Transform) -> "sitk.Transform":
+    import SimpleITK as sitk
+
+    return sitk.CompositeTransform([_TO_ITK[type(stage)](stage) for stage in reversed(transform.stages)])
+
+
+def _affine(affine: Affine) -> "sitk.Transform":
+    import SimpleITK as sitk
+
+    matrix = affine.matrix.detach().cpu().double().flatten().tolist()
+    return sitk.AffineTransform(matrix, affine.offset.detach().cpu().double().tolist())
+
+
+def _displacement(stage: Displacement) -> "sitk.Transform":
+    import SimpleITK as sitk
+
+    return sitk.DisplacementFieldTransform(
+        itk.from_values(itk.to_world_vectors(stage.field.data, stage.field), stage.field)
+    )
+
+
+_TO_ITK: dict[type, Callable[[Any], "sitk.Transform"]] = {Affine: _affine, Displacement: _displacement}
+
+
+def _save(transform: "sitk.Transform", path: Path) -> None:
+    import SimpleITK as sitk
+
+    with staged(path.parent) as folder:
         try:
             with native_stderr():
-                sitk.WriteTransform(sitk.CompositeTransform([field]), str(folder / file.name))
+                sitk.WriteTransform(transform, str(folder / path.name))
         except RuntimeError as error:
             raise InputError(f"{path} cannot be written: {itk.reason(error)}; use the ending .h5") from error
 
 
 def _world_field(u: Tensor, fixed: Image, name: str) -> "np.ndarray[tuple[int, ...], np.dtype[np.float64]]":
+    _check_field(u, fixed, name)
+    return itk.to_world_vectors(u, fixed)
+
+
+def _check_field(u: Tensor, fixed: Image, name: str) -> None:
     fixed.grid.check_vector(u, name)
     if u.shape[0] != 1:
         raise InputError(f"{name} must hold one displacement, got a batch of {u.shape[0]}; write them one by one")
-    return itk.to_world_vectors(u, fixed)

@@ -1,45 +1,35 @@
-"""Registration by flows: forces ask for divergence and curl, least squares give the velocity, its flow moves φ."""
+"""Registration by flows, from the images to the result: checks, scales, places, climbs the levels, inverts, judges."""
 
-import math
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 
 import torch
 from torch import Tensor
 
-from torchdeform.diagnostics import Diagnosis, diagnose, inverse_error, one_sided_determinant
+from torchdeform.diagnostics import Diagnosis, diagnose, inverse_error, smallest_determinant
 from torchdeform.errors import ComputationError, InputError
-from torchdeform.fem.form import Form, Row, Term
-from torchdeform.fem.operator import assemble_load
-from torchdeform.fem.spectral import TransformSolver
-from torchdeform.fem.weights import Weights
-from torchdeform.flow import integrate
 from torchdeform.grid import Grid
-from torchdeform.image import Image, luminance, require_registrable, resample
-from torchdeform.registration.pyramid import MIN_NODES, prolong, pyramid_grids, restrict
-from torchdeform.registration.result import Callback, LevelRecord, Progress, RegistrationResult
+from torchdeform.image import Image, resample
+from torchdeform.registration.affine import Alignment, align
+from torchdeform.registration.comparison import compare_from_fixed
+from torchdeform.registration.discrete import discrete_start
+from torchdeform.registration.evaluation import evaluate_images, evaluate_tensors
+from torchdeform.registration.guidance import Guidance
+from torchdeform.registration.levels import climb_levels, threads_worth
+from torchdeform.registration.placing import Subject, moved, place, subjects
+from torchdeform.registration.pyramid import MIN_NODES
+from torchdeform.registration.result import Callback, LevelRecord, RegistrationResult
+from torchdeform.registration.scene import Scene, tensor_scene
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.registration.similarity import Similarity, make_similarity, scale_intensities
-from torchdeform.stencil import derivative, jacobian_determinant
-from torchdeform.warp import compose, invert, max_voxels, warp
-
-# Steps over which a level must have gained, see `RegistrationSettings.tolerance`.
-_PATIENCE = 10
-
-# The step falls to this share of itself over a level.
-_LAST_STEP = 0.1
-
-# Fewer nodes than this are not worth more than one thread: with two threads beside another busy program, a pair of
-# 291×216 took twice as long as with one.
-_NODES_PER_THREAD = 2**16
-
-# Weight of the divergence that opens up nearly folded places, against a force of 1 at its strongest.
-_RESISTANCE = 3.0
-
-# A step that is still too bold at this fraction of itself is not taken.
-_SHORTEST = 2.0**-6
+from torchdeform.registration.symmetric import (
+    Middle,
+    between_images,
+    between_tensors,
+    climb_from_middle,
+    common_axes,
+)
+from torchdeform.transform import Affine
+from torchdeform.warp import invert, warp
 
 
 @torch.no_grad()
@@ -48,22 +38,31 @@ def register(
     moving: Tensor | Image,
     config: RegistrationSettings | None = None,
     *,
+    guidance: Guidance | None = None,
+    affine: Affine | None = None,
+    start: Tensor | None = None,
     callback: Callback | None = None,
 ) -> RegistrationResult:
-    """Return the map φ that maximises S(fixed, moving ∘ φ), grown as a composition of flows, coarse to fine.
+    """Return the map φ that maximises S(fixed, moving ∘ A ∘ φ), grown as a composition of flows, coarse to fine.
 
     Args:
         fixed: image that stays: ``(B, C, *S)`` with a pair per item, or an `Image`.
         moving: image that is warped; a tensor of the same shape, or an `Image` anywhere in the same world.
         config: settings; those of the preset ``default`` when None.
+        guidance: masks, landmarks and labels.
+        affine: map A from the world of the fixed image to that of the moving one, for images; when None, that which
+            `align` finds as ``config.align`` says.
+        start: displacement ``(B, D, *S)`` in units of spacing to begin with, fold-free; what the coarsest level cannot
+            hold of it is found again or lost. What ``config.start`` says when None.
         callback: is shown every step.
 
     Returns:
-        `RegistrationResult`. For tensors the unit is the voxel. For images it is that of the files (mm), colours are
-        registered on their luminance, and ``warped`` is the moving image, colours and all, sampled once.
+        `RegistrationResult`. For tensors the unit is the voxel. For images it is that of the files (mm), all channels
+        are compared (see `corresponding_channels`), and ``warped`` is the moving image sampled once.
 
     Raises:
-        InputError: shapes, fewer than 8 nodes on an axis, NaN or constant images, 2D against 3D.
+        InputError: shapes, fewer than 8 nodes on an axis, NaN or constant images, 2D against 3D, channels that do not
+            correspond, a start that folds, guidance that does not fit.
         ComputationError: the map is not finite.
 
     Notes:
@@ -71,30 +70,55 @@ def register(
         being the div-curl least squares with w_d, w_c and w_0 = w_d / length²; φ ← φ ∘ flow(v), the longest move being
         ``step_length`` voxels, less where a one-sided determinant would fall below ``min_determinant``. A level keeps
         its most similar map. Items of a batch do not influence each other. Liu, Liao & Xue 2007, section 2, with the
-        controls driven by the images.
+        controls driven by the images. Landmarks add the force of their squared distance at the points. With
+        ``symmetric`` two maps from a space between move against each other, and φ = φ_m ∘ φ_f⁻¹.
     """
-    settings = config or RegistrationSettings()
+    settings, guidance = config or RegistrationSettings(), guidance or Guidance()
     if isinstance(fixed, Image) and isinstance(moving, Image):
-        return _register_images(fixed, moving, settings, callback)
+        return _register_images((fixed, moving), settings, guidance, affine, start, callback)
     if isinstance(fixed, Image) or isinstance(moving, Image):
         raise InputError("register: fixed and moving must be two tensors or two Images, not one of each")
-    grid = _checked_grid(fixed, moving)
-    scaled = scale_intensities(fixed, moving, jointly=settings.similarity == "ssd")
-    return _optimise(*scaled, moving, grid, settings, callback)
+    if affine is not None:
+        raise InputError("register: affine is a map of the world, so fixed and moving must be Images")
+    return _register_tensors((fixed, moving), settings, guidance, start, callback)
 
 
-def _checked_grid(fixed: Tensor, moving: Tensor) -> Grid:
+def _register_tensors(
+    images: tuple[Tensor, Tensor],
+    settings: RegistrationSettings,
+    guidance: Guidance,
+    start: Tensor | None,
+    callback: Callback | None,
+) -> RegistrationResult:
+    fixed, moving = images
+    grid = _checked_grid(fixed, moving, guidance)
+    scene = tensor_scene(fixed, moving, grid, guidance)
+    _require_finite(scene)
+    scene = scene.scaled(settings)
+    middle = between_tensors(scene) if settings.symmetric else None
+    u, records = _climb(scene, middle, settings, start, callback)
+    result = _finish(scene, u, settings, records)
+    with threads_worth(len(u), grid):
+        return replace(result, warped=warp(moving, u, grid), evaluation=evaluate_tensors(guidance, u, grid))
+
+
+def _checked_grid(fixed: Tensor, moving: Tensor, guidance: Guidance) -> Grid:
     if not isinstance(fixed, Tensor) or fixed.dim() not in (4, 5):
         raise InputError("register: fixed must be a tensor (B, C, *S) with 2 or 3 axes in S, or an Image")
     grid = Grid(tuple(fixed.shape[2:]))
     for name, image in (("fixed", fixed), ("moving", moving)):
         grid.check(image, f"register: {name}", components=fixed.shape[1])
-        if not bool(image.isfinite().all()):
-            raise InputError(f"register: {name} has values that are NaN or infinite; replace them first")
     if fixed.shape[0] != moving.shape[0] or fixed.dtype != moving.dtype or fixed.device != moving.device:
         raise InputError("register: fixed and moving must agree in batch size, dtype and device")
     _require_size(grid)
+    guidance.require_tensors(grid, fixed.shape[0])
     return grid
+
+
+def _require_finite(scene: Scene) -> None:
+    for name, image in (("fixed", scene.fixed), ("moving", scene.moving)):
+        if not bool(image.isfinite().all()):
+            raise InputError(f"register: {name} has values that are NaN or infinite; replace or mask them first")
 
 
 def _require_size(grid: Grid) -> None:
@@ -103,122 +127,113 @@ def _require_size(grid: Grid) -> None:
 
 
 def _register_images(
-    fixed: Image, moving: Image, settings: RegistrationSettings, callback: Callback | None
-) -> RegistrationResult:
-    """Take the moving image onto the fixed grid in its physical place, register, and sample the original once."""
-    _require_size(fixed.grid)
-    grey = luminance(fixed), luminance(moving)
-    for image in grey:
-        require_registrable(image)
-    placed = resample(grey[1], grey[0], outside=None).to(grey[0].data.dtype)
-    scaled = scale_intensities(grey[0].data, placed, jointly=settings.similarity == "ssd")
-    result = _optimise(*scaled, placed, fixed.grid, settings, callback)
-    warped = resample(moving, fixed, result.displacement).to(moving.data.dtype)
-    return replace(result, warped=warped)
-
-
-@dataclass(frozen=True)
-class _Level:
-    """What stays the same during the steps of one level."""
-
-    index: int
-    grid: Grid
-    moving: Tensor
-    similarity: Similarity
-    metric: TransformSolver
-    controls: Form
-    power: int
-
-
-def _make_level(index: int, grid: Grid, images: tuple[Tensor, Tensor], settings: RegistrationSettings) -> _Level:
-    fixed, moving = images
-    voxel = grid.cell_volume ** (1 / grid.dim)
-    weights = Weights(
-        div=settings.weight_div,
-        curl=settings.weight_curl,
-        zero=settings.weight_div / (settings.length * voxel) ** 2,
-    )
-    divergence = Row(_RESISTANCE, tuple(Term(1.0, k, k) for k in range(grid.dim)))
-    force = tuple(Row(1.0, (Term(1.0, k, None),)) for k in range(grid.dim))
-    return _Level(
-        index=index,
-        grid=grid,
-        moving=moving,
-        similarity=make_similarity(settings.similarity, fixed, settings.window),
-        metric=TransformSolver(grid, weights, "slip", dtype=fixed.dtype, device=fixed.device),
-        controls=(divergence, *force),
-        power=settings.power,
-    )
-
-
-def _optimise(
-    fixed: Tensor,
-    moving: Tensor,
-    original: Tensor,
-    grid: Grid,
+    images: tuple[Image, Image],
     settings: RegistrationSettings,
+    guidance: Guidance,
+    affine: Affine | None,
+    start: Tensor | None,
     callback: Callback | None,
 ) -> RegistrationResult:
-    """Run the levels on scaled images."""
-    grids = pyramid_grids(grid, len(settings.steps))
-    steps = settings.steps[-len(grids) :]
-    u = fixed.new_zeros(fixed.shape[0], grid.dim, *grids[0].shape)
-    records = []
-    for index, (coarse, count) in enumerate(zip(grids, steps, strict=True)):
-        images = restrict(fixed, grid, coarse), restrict(moving, grid, coarse)
-        level = _make_level(index, coarse, images, settings)
-        with _threads_worth(fixed.shape[0], coarse):
-            u, record = _run_level(level, _unfold(prolong(u, coarse), coarse), count, len(grids), settings, callback)
-        records.append(record)
-    with _threads_worth(fixed.shape[0], grid):
-        return _finish((fixed, moving, original), u, grid, settings, records)
+    """Take the moving image onto the fixed grid in its physical place, register, and sample the original once."""
+    fixed, moving = images
+    _require_size(fixed.grid)
+    guidance.require_images(fixed.grid.dim)
+    both = subjects(fixed, moving, guidance)
+    alignment = None
+    if affine is None and settings.align != "none":
+        alignment = _aligned(fixed, moving, settings, guidance)
+        affine = alignment.affine
+    seen = moving if affine is None else moved(moving, affine.inverse())
+    scene = place(both[0], both[1] if affine is None else both[1].moved(affine.inverse()), fixed).scaled(settings)
+    middle = _between(both, scene, affine, settings) if settings.symmetric else None
+    u, records = _climb(scene, middle, settings, start, callback)
+    result = _finish(scene, u, settings, records)
+    return replace(
+        result,
+        warped=resample(seen, fixed, u).to(moving.data.dtype),
+        affine=affine,
+        alignment=alignment,
+        evaluation=evaluate_images(fixed, guidance, affine, u),
+        seconds=({"align": alignment.seconds} if alignment else {}) | result.seconds,
+    )
 
 
-@contextmanager
-def _threads_worth(items: int, grid: Grid) -> Iterator[None]:
-    """Use no more of torch's threads than the fields are worth: on a shared machine small ones wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(max(1, min(before, items * math.prod(grid.shape) // _NODES_PER_THREAD)))
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+def _aligned(fixed: Image, moving: Image, settings: RegistrationSettings, guidance: Guidance) -> Alignment:
+    """Align as the settings say, with masks."""
+    masks = (guidance.fixed_mask, guidance.moving_mask)
+    first, second = (mask if isinstance(mask, Image) else None for mask in masks)
+    return align(fixed, moving, settings.align, fixed_mask=first, moving_mask=second)
+
+
+def _between(
+    both: tuple[Subject, Subject], scene: Scene, affine: Affine | None, settings: RegistrationSettings
+) -> Middle:
+    """Return the middle space of two images; where they share a grid and a place it is theirs."""
+    places = [(s.image.grid, s.image.origin, s.image.direction) for s in both]
+    if affine is None and places[0] == places[1]:
+        return between_tensors(scene)
+    middle = between_images(*both, affine, common_axes(both[0].image, both[1].image))
+    return replace(middle, scene=middle.scene.scaled(settings))
+
+
+def _climb(
+    scene: Scene,
+    middle: Middle | None,
+    settings: RegistrationSettings,
+    start: Tensor | None,
+    callback: Callback | None,
+) -> tuple[Tensor, tuple[LevelRecord, ...]]:
+    """Return the displacement on the fixed grid, from there or from the middle, and how each level went."""
+    if start is not None:
+        start = _checked_start(start, scene)
+    elif settings.start == "discrete":
+        start = discrete_start(scene.fixed, scene.moving, scene.grid, mask=scene.fixed_mask)
+    if middle is not None:
+        return climb_from_middle(middle, scene.grid, settings, start, callback)
+    return climb_levels(scene, settings, start, callback)
+
+
+def _checked_start(start: Tensor, scene: Scene) -> Tensor:
+    grid = scene.grid
+    grid.check_vector(start, "register: start")
+    if len(start) != len(scene.fixed):
+        raise InputError(f"register: start must have {len(scene.fixed)} batch items, got {len(start)}")
+    if not bool((smallest_determinant(start, grid) > 0).all()):
+        raise InputError("register: start folds or is not finite; smooth it, or scale it down")
+    return start.to(scene.fixed)
 
 
 def _finish(
-    images: tuple[Tensor, Tensor, Tensor],
-    u: Tensor,
-    grid: Grid,
-    settings: RegistrationSettings,
-    records: list[LevelRecord],
+    scene: Scene, u: Tensor, settings: RegistrationSettings, records: tuple[LevelRecord, ...]
 ) -> RegistrationResult:
-    """Invert the map and judge it."""
-    fixed, moving, original = images
-    start = perf_counter()
-    similarity = make_similarity(settings.similarity, fixed, settings.window)
-    before, after = (similarity.evaluate(image)[0] for image in (moving, warp(moving, u, grid)))
-    middle = perf_counter()
-    inverse = invert(u, grid)
-    mean, largest = inverse_error(u, inverse, grid)
-    inverted = perf_counter()
-    return RegistrationResult(
-        displacement=u,
-        inverse=inverse,
-        warped=warp(original, u, grid),
-        grid=grid,
-        similarity_before=before,
-        similarity_after=after,
-        diagnosis=_require_sound(u, grid),
-        inverse_error_mean=mean,
-        inverse_error_max=largest,
-        levels=tuple(records),
-        seconds={
-            "register": sum(record.seconds for record in records) + middle - start,
-            "invert": inverted - middle,
-            "diagnose": perf_counter() - inverted,
-        },
-        settings=settings,
-    )
+    """Invert the map and judge it; the warped image is still the one that was compared."""
+    grid = scene.grid
+    with threads_worth(len(u), grid):
+        start = perf_counter()
+        comparison = compare_from_fixed(scene, settings)
+        before, after = (comparison.look(w)[1] for w in (torch.zeros_like(u), u))
+        middle = perf_counter()
+        inverse = invert(u, grid)
+        mean, largest = inverse_error(u, inverse, grid)
+        inverted = perf_counter()
+        return RegistrationResult(
+            displacement=u,
+            inverse=inverse,
+            warped=warp(scene.moving, u, grid),
+            grid=grid,
+            similarity_before=before,
+            similarity_after=after,
+            diagnosis=_require_sound(u, grid),
+            inverse_error_mean=mean,
+            inverse_error_max=largest,
+            levels=records,
+            seconds={
+                "register": sum(record.seconds for record in records) + middle - start,
+                "invert": inverted - middle,
+                "diagnose": perf_counter() - inverted,
+            },
+            settings=settings,
+        )
 
 
 def _require_sound(u: Tensor, grid: Grid) -> Diagnosis:
@@ -227,114 +242,3 @@ def _require_sound(u: Tensor, grid: Grid) -> Diagnosis:
             "register: the map is not finite; check the images for extreme values, or lower step_length"
         )
     return diagnose(u, grid)
-
-
-def _run_level(
-    level: _Level, u: Tensor, steps: int, levels: int, settings: RegistrationSettings, callback: Callback | None
-) -> tuple[Tensor, LevelRecord]:
-    """Climb one level; every item ends at the most similar map it met."""
-    start, shortened = perf_counter(), 0
-    best, values = u, []
-    top = u.new_full((u.shape[0],), -torch.inf)
-    active = torch.ones_like(top, dtype=torch.bool)
-    tops, lowest = [], _lowest(u, level.grid)
-    for step in range(steps + 1):
-        warped = warp(level.moving, u, level.grid)
-        value, gradient = level.similarity.evaluate(warped)
-        best, top = _keep(value > top, (u, value), (best, top))
-        values.append(value)
-        tops.append(top)
-        if callback:
-            callback(Progress(level.index, levels, step, steps, value, level.grid.shape))
-        active &= ~_stalled(tops, settings.tolerance)
-        if step == steps or not bool(active.any()):
-            break
-        pace = settings.step_length * (1 - (1 - _LAST_STEP) * step / steps)
-        divergence = (settings.soft_determinant / lowest - 1).clamp_(min=0)
-        move = _move(level, warped, gradient, divergence) * _column(pace * active, u)
-        u, lowest, moved, short = _advance((u, lowest), move, level.grid, settings.min_determinant)
-        active &= moved
-        shortened += short
-    return best, LevelRecord(level.grid.shape, tuple(values), shortened, perf_counter() - start)
-
-
-def _stalled(tops: list[Tensor], tolerance: float) -> Tensor:
-    """True for the items whose last steps raised the best similarity by too small a share of the whole rise."""
-    if len(tops) <= _PATIENCE:
-        return torch.zeros_like(tops[0], dtype=torch.bool)
-    return tops[-1] - tops[-1 - _PATIENCE] <= tolerance * (tops[-1] - tops[0])
-
-
-def _move(level: _Level, warped: Tensor, gradient: Tensor, divergence: Tensor) -> Tensor:
-    """Return the velocity that least squares find for the force and the divergence, its longest move being one voxel.
-
-    The force is scaled to 1 at its strongest, so the divergence needs no unit of similarity.
-    """
-    grid = level.grid
-    force = torch.cat([(gradient * derivative(warped, grid, a)).sum(1, keepdim=True) for a in range(grid.dim)], dim=1)
-    tiny = torch.finfo(force.dtype).tiny
-    force = force / _column(force.square().sum(1).flatten(1).amax(1).sqrt().clamp(min=tiny), force)
-    v = level.metric.solve(
-        assemble_load(level.controls, torch.cat([divergence, force], dim=1), grid), power=level.power
-    )
-    return v / _column(max_voxels(v, grid).clamp(min=tiny), v)
-
-
-def _advance(
-    state: tuple[Tensor, Tensor], move: Tensor, grid: Grid, limit: float
-) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Return u ∘ flow(move) and its `_lowest`, which items moved, and how often a step was halved.
-
-    No determinant falls below ``limit``, or below the smallest one there was if that was less. Along the halvings the
-    trial tends to u, so a bold step ends as a short one.
-    """
-    u, lowest = state
-    floor = lowest.flatten(1).amin(1).clamp(max=limit)
-    fraction, halved = torch.ones_like(floor), 0
-    while True:
-        trial = compose(u, integrate(move * _column(fraction, u), grid, steps=1, method="midpoint"), grid)
-        trial_lowest = _lowest(trial, grid)
-        low = ~(trial_lowest.flatten(1).amin(1) >= floor)
-        count = int(low.sum())
-        if count == 0:
-            return trial, trial_lowest, ~low, halved
-        if bool((fraction[low] <= _SHORTEST).all()):
-            (u, lowest) = _keep(~low, (trial, trial_lowest), state)
-            return u, lowest, ~low, halved
-        halved += count
-        fraction = torch.where(low, fraction / 2, fraction)
-
-
-def _lowest(u: Tensor, grid: Grid) -> Tensor:
-    """Return at each node the smallest determinant ``(B, 1, *S)``, one-sided or by `jacobian_determinant`.
-
-    Inside Ω the latter is a mean of one-sided ones. On the faces, where it extrapolates, it has to be looked at.
-    """
-    lowest = one_sided_determinant(u, grid)
-    for axis, n in zip(grid.axes, grid.shape, strict=True):
-        layers = torch.cat([u.narrow(axis, 0, 3), u.narrow(axis, n - 3, 3)])
-        first, last = jacobian_determinant(layers, Grid(tuple(layers.shape[2:]), grid.spacing)).chunk(2)
-        for node, det in ((0, first), (n - 1, last)):
-            face = lowest.select(axis, node)
-            torch.minimum(face, det.select(axis, 0 if node == 0 else 2), out=face)
-    return lowest
-
-
-def _unfold(u: Tensor, grid: Grid) -> Tensor:
-    """Return u, drawn towards 0 until it does not fold: interpolation to a finer grid may, rarely, fold a map."""
-    while bool((low := ~(_lowest(u, grid).flatten(1).amin(1) > 0)).any()):
-        u = torch.where(_column(low, u), 0.9 * u, u)
-    return u
-
-
-def _keep(chosen: Tensor, new: tuple[Tensor, Tensor], old: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Return both new tensors for the chosen items, the old ones for the others."""
-    if bool(chosen.all()):
-        return new
-    first, second = (torch.where(_column(chosen, n), n, o) for n, o in zip(new, old, strict=True))
-    return first, second
-
-
-def _column(per_item: Tensor, like: Tensor) -> Tensor:
-    """Return ``(B,)`` as ``(B, 1, 1, ..)``, to go with a field."""
-    return per_item.view(-1, *([1] * (like.dim() - 1)))

@@ -7,7 +7,10 @@ from torch import Tensor
 
 from torchdeform.diagnostics import Diagnosis
 from torchdeform.grid import Grid
+from torchdeform.registration.affine import Alignment
+from torchdeform.registration.evaluation import Evaluation
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.transform import Affine
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,10 @@ class RegistrationResult:
         levels: one record per pyramid level, coarse to fine.
         seconds: wall time per stage.
         settings: the settings used.
+        affine: map A of the world that comes after φ: a point x of the fixed space goes to A(φ(x)), and warped(x) =
+            moving(A(φ(x))); None for the identity. ``displacement``, ``inverse`` and ``diagnosis`` are of φ alone.
+        alignment: how that map was found; None where it was given, or none was asked for.
+        evaluation: what labels and landmarks say; None without them.
     """
 
     displacement: Tensor
@@ -83,3 +90,6 @@ class RegistrationResult:
     levels: tuple[LevelRecord, ...]
     seconds: dict[str, float]
     settings: RegistrationSettings
+    affine: Affine | None = None
+    alignment: Alignment | None = None
+    evaluation: Evaluation | None = None

@@ -1,12 +1,34 @@
 """Settings of a registration: typed, frozen, checked when made."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from numbers import Real
 
 from torchdeform.errors import InputError, require_choice
 
-SIMILARITIES = ("lncc", "ssd")
+SIMILARITIES = ("ssd", "ncc", "lncc", "mi", "nmi", "ngf", "mind")
+ALIGNMENTS = ("none", "translation", "rigid", "similarity", "affine")
+STARTS = ("identity", "discrete")
+
+
+def similarity_weights(similarity: str | Mapping[str, float]) -> dict[str, float]:
+    """Return the measures that a setting ``similarity`` names, with their weights.
+
+    Args:
+        similarity: a name of `SIMILARITIES`, which has weight 1, or names with their weights.
+
+    Raises:
+        InputError: no name, an unknown one, or a weight that is not positive and finite.
+    """
+    if not isinstance(similarity, str | Mapping) or not similarity:
+        raise InputError(f"similarity must name one of {', '.join(SIMILARITIES)}, or several with their weights")
+    weights = {similarity: 1.0} if isinstance(similarity, str) else dict(similarity)
+    for name, weight in weights.items():
+        require_choice(name, SIMILARITIES, "similarity")
+        if isinstance(weight, bool) or not isinstance(weight, Real) or not 0 < weight < math.inf:
+            raise InputError(f"similarity: the weight of {name} must be a positive finite number, got {weight!r}")
+    return weights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,12 +36,20 @@ class RegistrationSettings:
     """Everything that can be chosen; the defaults are the preset ``default``.
 
     Args:
+        align: how images (not tensors) are aligned first: ``none``, ``translation``, ``rigid``, ``similarity`` or
+            ``affine``, see `align`.
+        start: map to begin with: ``identity``, or ``discrete`` for one from a search over large displacements, see
+            `discrete_start`.
         similarity: ``lncc`` (squared local normalised cross-correlation, for images of one contrast with different
-            brightness) or ``ssd`` (mean squared difference, for images on the same intensity scale).
+            brightness), ``ncc`` (the correlation of whole images), ``ssd`` (mean squared difference, for images on the
+            same intensity scale); for images of different contrast ``mi`` and ``nmi`` (mutual information, normalised),
+            ``ngf`` (directions of the gradients), ``mind`` (self-similarity of patches). Or several of them with
+            positive weights, as ``{lncc: 1, mi: 0.5}``.
         window: width of the LNCC window in voxels, odd.
         weight_div: price w_d of a change of volume in the metric; large keeps volumes.
         weight_curl: price w_c of a rotation.
-        length: range √(w_d / w_0) of the metric in voxels of each level; longer makes the velocity smoother.
+        length: range √(w_d / w_0) of the metric in voxels of each level; longer makes the velocity smoother. One
+            number, or one for each level, coarse to fine: the last is for the finest, the first for all not named.
         power: 1, or 2 for a smoother velocity, see `TransformSolver.solve`.
         steps: steps at most on each pyramid level, coarse to fine; its length is the number of levels (a level that
             would leave fewer than 8 nodes on every axis is dropped).
@@ -28,25 +58,36 @@ class RegistrationSettings:
         soft_determinant: where a one-sided determinant J is smaller than this, a divergence proportional to
             soft_determinant/J − 1 is asked for, which opens the grid up again; 0 switches it off.
         min_determinant: smallest one-sided determinant that a step may leave; a step that would go below is shortened.
+        points_weight: what landmarks weigh against the similarity: the mean of |φ(p) − q|² over the pairs, in squared
+            units of spacing (mm² for images), is multiplied by this and taken off; 0 only measures them.
+        symmetric: prefer neither image: both are warped into a space between, so that swapping them inverts the map.
 
     Raises:
         InputError: a value out of range, named.
     """
 
-    similarity: Literal["lncc", "ssd"] = "lncc"
+    align: str = "affine"
+    start: str = "identity"
+    similarity: str | Mapping[str, float] = "lncc"
     window: int = 9
     weight_div: float = 1.0
     weight_curl: float = 1.0
-    length: float = 12.0
+    length: float | tuple[float, ...] = (24.0, 24.0, 12.0)
     power: int = 1
     steps: tuple[int, ...] = (100, 100, 30)
     step_length: float = 0.5
     tolerance: float = 0.02
     soft_determinant: float = 0.15
     min_determinant: float = 0.03
+    points_weight: float = 0.0
+    symmetric: bool = False
 
     def __post_init__(self) -> None:
-        require_choice(self.similarity, SIMILARITIES, "similarity")
+        require_choice(self.align, ALIGNMENTS, "align")
+        require_choice(self.start, STARTS, "start")
+        similarity_weights(self.similarity)
+        if not isinstance(self.similarity, str):  # a copy of our own, and a dict, which `asdict` can take
+            object.__setattr__(self, "similarity", dict(self.similarity))
         if self.window < 3 or self.window % 2 == 0:
             raise InputError(f"window must be an odd number of voxels, at least 3, got {self.window}")
         if not self.steps or min(self.steps) < 0:
@@ -55,9 +96,19 @@ class RegistrationSettings:
             raise InputError(f"power must be 1 or 2, got {self.power}")
         if not 0 < self.min_determinant < 1:
             raise InputError(f"min_determinant must lie between 0 and 1, got {self.min_determinant}")
-        for name in ("weight_div", "weight_curl", "length", "step_length"):
+        if not self._lengths or not all(0 < length < math.inf for length in self._lengths):
+            raise InputError(f"length must be positive and finite, one number or one for each level, got {self.length}")
+        for name in ("weight_div", "weight_curl", "step_length"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be positive and finite, got {getattr(self, name)}")
-        for name in ("soft_determinant", "tolerance"):
+        for name in ("soft_determinant", "tolerance", "points_weight"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be finite and not negative, got {getattr(self, name)}")
+
+    @property
+    def _lengths(self) -> tuple[float, ...]:
+        return (self.length,) if isinstance(self.length, int | float) else tuple(self.length)
+
+    def length_at(self, below: int) -> float:
+        """Return the length for a level that has so many finer ones below it."""
+        return self._lengths[max(len(self._lengths) - 1 - below, 0)]

@@ -1,171 +1,103 @@
-"""Similarities of two images, each with its derivative in closed form: no tape is kept in the inner loop."""
+"""Similarities by name: which features are compared, by what, and with which weight."""
 
-from abc import ABC, abstractmethod
-from functools import lru_cache
+from collections.abc import Callable, Mapping
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from torchdeform.errors import InputError
+from torchdeform.grid import Grid
+from torchdeform.registration.metrics.base import Similarity, at_least_float32
+from torchdeform.registration.metrics.correlation import CrossCorrelation, LocalCrossCorrelation
+from torchdeform.registration.metrics.gradients import GradientFields
+from torchdeform.registration.metrics.information import MutualInformation
+from torchdeform.registration.metrics.mind import mind_ssc, neighbour_pairs
+from torchdeform.registration.metrics.squares import MeanSquaredDifference
+from torchdeform.registration.settings import similarity_weights
 
-# Added to both variances of LNCC, for images scaled to [0, 1]: windows flatter than a grey level of 0.3 % are flat.
-LNCC_FLOOR = 1e-5
-
-# Up to this many nodes an axis one product with the dense band matrix is the fastest box sum (3×128³ float32, window
-# 9: 24 ms an axis against 72 ms for sums of shifted views); its cost per node grows with the axis.
-_DENSE_LIMIT = 512
-
-
-class Similarity(ABC):
-    """A similarity S(fixed, warped) to be maximised, with everything that depends on the fixed image computed once."""
-
-    @abstractmethod
-    def evaluate(self, warped: Tensor) -> tuple[Tensor, Tensor]:
-        """Return S and its derivative.
-
-        Args:
-            warped: ``(B, C, *S)``, on the intensity scale of the fixed image.
-
-        Returns:
-            S per item ``(B,)``, a mean over voxels and channels; and N ∂S/∂warped ``(B, C, *S)``, N being the number of
-            these, so that the derivative does not depend on the size of the image.
-        """
+# The measures of images, by name: from the fixed image, the window of LNCC and the grid.
+_OF_IMAGES: dict[str, Callable[[Tensor, int, Grid], Similarity]] = {
+    "ssd": lambda fixed, window, grid: MeanSquaredDifference(fixed),
+    "ncc": lambda fixed, window, grid: CrossCorrelation(fixed),
+    "lncc": lambda fixed, window, grid: LocalCrossCorrelation(fixed, window),
+    "mi": lambda fixed, window, grid: MutualInformation(fixed),
+    "nmi": lambda fixed, window, grid: MutualInformation(fixed, normalised=True),
+    "ngf": lambda fixed, window, grid: GradientFields(fixed, grid),
+}
 
 
-class MeanSquaredDifference(Similarity):
-    """S = −mean (warped − fixed)².
+class Combination(Similarity):
+    """S = Σ w_k S_k / Σ w_k, each S_k being a similarity of some of the channels.
 
     Args:
-        fixed: ``(B, C, *S)``.
+        parts: w_k, the channels that S_k compares, and S_k.
     """
 
-    def __init__(self, fixed: Tensor) -> None:
-        self.fixed = fixed
+    def __init__(self, parts: list[tuple[float, slice, Similarity]]) -> None:
+        total = sum(weight for weight, _, _ in parts)
+        self.parts = [(weight / total, channels, part) for weight, channels, part in parts]
 
-    def evaluate(self, warped: Tensor) -> tuple[Tensor, Tensor]:
-        difference = self.fixed - warped
-        return -difference.square().flatten(1).mean(1), 2 * difference
-
-
-class LocalCrossCorrelation(Similarity):
-    """S = mean over x of c² / ((v_f + ε)(v_w + ε)), covariance and variances in the window around x.
-
-    Args:
-        fixed: ``(B, C, *S)``, scaled to about [0, 1].
-        window: width in voxels, odd. At the boundary the part of the window inside the image counts.
-
-    Notes:
-        Lies in [0, 1]. With a = 2c/((v_f + ε)(v_w + ε)), b = a c/(v_w + ε) and E the mean over a window, the
-        derivative by warped(y) is Σ [a (fixed(y) − E fixed) − b (warped(y) − E warped)] over the windows that hold y,
-        each divided by its number of voxels. ε = 1e-5 keeps flat regions finite: they count as not correlated.
-        Two sets of box sums a call, of 3 and of 4 fields; no window is visited voxel by voxel.
-    """
-
-    def __init__(self, fixed: Tensor, window: int) -> None:
-        self.fixed, self.window = fixed, window
-        self.share = 1 / box_sum(torch.ones_like(fixed[:1, :1]), window)
-        self.mean = box_sum(fixed, window) * self.share
-        self.variance = (box_sum(fixed * fixed, window) * self.share - self.mean**2).clamp_(min=0).add_(LNCC_FLOOR)
-
-    def evaluate(self, warped: Tensor) -> tuple[Tensor, Tensor]:
-        sums = box_sum(torch.cat([warped, warped * warped, warped * self.fixed], dim=1), self.window)
-        mean, square, product = sums.mul_(self.share).chunk(3, dim=1)
-        covariance = product.sub_(mean * self.mean)
-        variance = square.sub_(mean * mean).clamp_(min=0).add_(LNCC_FLOOR)
-        correlation = covariance / (variance * self.variance)
-        value = (correlation * covariance).flatten(1).mean(1)
-        a = correlation.mul_(2 * self.share)
-        b = a * covariance / variance
-        back = box_sum(torch.cat([a, a * self.mean, b, b * mean], dim=1), self.window)
-        a, a_mean, b, b_mean = back.chunk(4, dim=1)
-        return value, self.fixed * a - a_mean - warped * b + b_mean
+    def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        values, slope = [], torch.zeros_like(warped)
+        for weight, channels, part in self.parts:
+            own = warped[:, channels]
+            value, derivative = part.evaluate(own, mask)
+            values.append(weight * value)
+            slope[:, channels] += derivative * (weight * warped.shape[1] / own.shape[1])
+        return torch.stack(values).sum(0), slope
 
 
-def make_similarity(name: str, fixed: Tensor, window: int) -> Similarity:
-    """Return the similarity of that name to ``fixed``.
+def on_one_scale(similarity: str | Mapping[str, float]) -> bool:
+    """Return whether a measure compares intensities as they are, so that both images need one scale."""
+    return "ssd" in similarity_weights(similarity)
+
+
+def features(similarity: str | Mapping[str, float], image: Tensor) -> Tensor:
+    """Return what is warped and compared: the image, its MIND-SSC channels, or the one after the other.
 
     Args:
-        name: ``lncc`` or ``ssd``.
-        fixed: ``(B, C, *S)``.
-        window: width of the LNCC window in voxels.
-    """
-    return LocalCrossCorrelation(fixed, window) if name == "lncc" else MeanSquaredDifference(fixed)
-
-
-def scale_intensities(fixed: Tensor, moving: Tensor, *, jointly: bool) -> tuple[Tensor, Tensor]:
-    """Return both images with their 0.5 and 99.5 percentiles taken to 0 and 1, item by item.
-
-    Args:
-        fixed: ``(B, C, *S)``.
-        moving: the same shape.
-        jointly: one scale for both images, as a squared difference needs; otherwise each has its own.
-
-    Raises:
-        InputError: an image has no contrast.
-    """
-    if jointly:
-        both = _to_unit_range(torch.cat([fixed, moving], dim=1), "fixed and moving")
-        return both[:, : fixed.shape[1]].contiguous(), both[:, fixed.shape[1] :].contiguous()
-    return _to_unit_range(fixed, "fixed"), _to_unit_range(moving, "moving")
-
-
-def _to_unit_range(image: Tensor, name: str) -> Tensor:
-    values = image.flatten(1)
-    values = values[:, :: max(1, values.shape[1] // 2**20)].sort(dim=1).values  # quantile() stops at 2^24 values
-    last = values.shape[1] - 1
-    low, high = values[:, round(0.005 * last)], values[:, round(0.995 * last)]
-    flat = high <= low
-    low, high = torch.where(flat, values[:, 0], low), torch.where(flat, values[:, -1], high)
-    if not bool((high > low).all()):
-        raise InputError(f"register: {name} is constant, so there is nothing to align")
-    column = (-1, *([1] * (image.dim() - 1)))
-    return (image - low.view(column)) / (high - low).view(column)
-
-
-def box_sum(x: Tensor, window: int) -> Tensor:
-    """Return Σ x over the window around each node, cut off at the boundary.
-
-    Args:
-        x: ``(B, C, *S)``.
-        window: width in voxels, odd.
+        similarity: a name, or names with weights.
+        image: ``(B, C, *S)``, scaled to about [0, 1].
 
     Returns:
-        ``(B, C, *S)``.
+        ``(B, C', *S)``: C' is C without ``mind``, C·K with nothing else, C + C·K with both; K = 12 in 3D and 4 in 2D.
 
-    Notes:
-        Self-adjoint and linear. No running total, so nothing cancels in float32.
+    Raises:
+        InputError: as `similarity_weights`, `mind_ssc`.
     """
-    for axis in range(2, x.dim()):
-        small = x.shape[axis] <= _DENSE_LIMIT
-        x = _band_product(x, axis, window) if small else _sum_of_shifts(x, axis, window)
-    return x
+    weights = similarity_weights(similarity)
+    if "mind" not in weights:
+        return image
+    image = at_least_float32(image)
+    return mind_ssc(image) if len(weights) == 1 else torch.cat([image, mind_ssc(image)], dim=1)
 
 
-def _band_product(x: Tensor, axis: int, window: int) -> Tensor:
-    band = _band(x.shape[axis], window, x.dtype, x.device)
-    if axis == x.dim() - 1:
-        return x @ band
-    return (band @ x.flatten(axis + 1)).view(x.shape) if axis + 1 < x.dim() else x
+def make_similarity(
+    similarity: str | Mapping[str, float], fixed: Tensor, window: int = 9, *, grid: Grid | None = None
+) -> Similarity:
+    """Return the similarity of that name, or of those names and weights, to ``fixed``.
+
+    Args:
+        similarity: a name, or names with weights.
+        fixed: ``(B, C', *S)``, the `features` of the fixed image.
+        window: width of the LNCC window in voxels.
+        grid: their grid, whose spacing the gradients of ``ngf`` need; spacing 1 when None.
+
+    Returns:
+        A `Similarity` whose ``evaluate`` takes the warped features of the moving image.
+
+    Raises:
+        InputError: as `similarity_weights`.
+    """
+    weights, grid = similarity_weights(similarity), grid or Grid(tuple(fixed.shape[2:]))
+    if len(weights) == 1:
+        return _part(next(iter(weights)), fixed, window, grid)
+    channels = fixed.shape[1] // (1 + len(neighbour_pairs(grid.dim))) if "mind" in weights else fixed.shape[1]
+    parts = []
+    for name, weight in weights.items():
+        own = slice(channels, None) if name == "mind" else slice(0, channels)
+        parts.append((weight, own, _part(name, fixed[:, own], window, grid)))
+    return Combination(parts)
 
 
-@lru_cache(maxsize=64)
-def _band(size: int, window: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    with torch.inference_mode(False):
-        node = torch.arange(size, device=device)
-        return ((node[:, None] - node).abs() <= window // 2).to(dtype)
-
-
-def _sum_of_shifts(x: Tensor, axis: int, window: int) -> Tensor:
-    padding = [0, 0] * (x.dim() - 1 - axis) + [window // 2] * 2
-    return _windows(F.pad(x, padding), axis, window)
-
-
-def _windows(x: Tensor, axis: int, window: int) -> Tensor:
-    """Sums of ``window`` neighbours where all exist: two sums of half the window, and one entry if it is odd."""
-    if window == 1:
-        return x
-    half, count = window // 2, x.shape[axis] - window + 1
-    sums = _windows(x, axis, half)
-    total = sums.narrow(axis, 0, count) + sums.narrow(axis, half, count)
-    return total.add_(x.narrow(axis, window - 1, count)) if window % 2 else total
+def _part(name: str, fixed: Tensor, window: int, grid: Grid) -> Similarity:
+    return MeanSquaredDifference(fixed) if name == "mind" else _OF_IMAGES[name](fixed, window, grid)

@@ -11,6 +11,7 @@ import torch
 
 from torchdeform import __version__
 from torchdeform.image import Image
+from torchdeform.registration.evaluation import Evaluation, Measures
 from torchdeform.registration.result import LevelRecord, RegistrationResult
 
 
@@ -39,6 +40,8 @@ def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[st
         "inverse_error_mean": result.inverse_error_mean.item(),
         "inverse_error_max": result.inverse_error_max.item(),
         "seconds": result.seconds,
+        "alignment": _alignment(result),
+        "evaluation": _evaluation(result.evaluation),
         "levels": [_level(level) for level in result.levels],
         "device": device_name(result.displacement.device),
         "settings": asdict(result.settings),
@@ -55,6 +58,46 @@ def _place(image: Image) -> dict[str, object]:
         "channels": image.data.shape[1],
         "pixel_type": image.pixel_type,
     }
+
+
+def _alignment(result: RegistrationResult) -> dict[str, object]:
+    """Return the affine map x -> M x + t of the world (x, y, z in LPS mm), and how it was found."""
+    if result.affine is None:
+        return {"kind": "none"}
+    found = result.alignment
+    return {
+        "kind": result.settings.align if found else "given",
+        "matrix": result.affine.matrix.tolist(),
+        "offset": result.affine.offset.tolist(),
+        "start": found and found.start,
+        "similarity_before": found and found.similarity_before,
+        "similarity_after": found and found.similarity_after,
+    }
+
+
+def _evaluation(evaluation: Evaluation | None) -> dict[str, object]:
+    """Return overlap and distances before, after alignment and after all."""
+    if evaluation is None:
+        return {}
+    stages = {"before": evaluation.before, "aligned": evaluation.aligned, "after": evaluation.after}
+    return {name: _measures(measures) for name, measures in stages.items() if measures is not None}
+
+
+def _measures(measures: Measures) -> dict[str, object]:
+    """Return the figures of one position; distances in mm."""
+    found: dict[str, object] = {}
+    if measures.labels:
+        names = [str(label) for label in measures.labels]
+        found["dice_mean"] = measures.dice[0].nanmean().item()
+        found["dice"] = dict(zip(names, measures.dice[0].tolist(), strict=True))
+        found["hausdorff_95"] = dict(zip(names, measures.hausdorff[0].tolist(), strict=True))
+    if measures.distances is not None:
+        errors = measures.distances[0]
+        found["landmark_error_mean"] = errors.mean().item()
+        found["landmark_error_median"] = errors.median().item()
+        found["landmark_error_max"] = errors.max().item()
+        found["landmark_errors"] = errors.tolist()
+    return found
 
 
 def _level(level: LevelRecord) -> dict[str, object]:

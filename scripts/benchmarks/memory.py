@@ -1,0 +1,87 @@
+"""Peak memory of registrations from files to files, beside what `torchdeform.memory.estimate` says.
+
+Each case runs in a process of its own: python scripts/benchmarks/memory.py [--quick]
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# Dimension, voxels along an axis, channels, similarity.
+QUICK = ((2, 512, 1, "lncc"), (3, 64, 1, "lncc"))
+CASES = (
+    *((2, n, 1, "lncc") for n in (512, 1024, 2048)),
+    *((2, 1024, c, s) for c, s in ((1, "ssd"), (1, "mi"), (1, "ngf"), (1, "mind"), (3, "lncc"))),
+    *((3, n, 1, "lncc") for n in (64, 96, 128, 160)),
+    *((3, 96, c, s) for c, s in ((1, "ssd"), (1, "ncc"), (1, "mi"), (1, "ngf"), (1, "mind"), (3, "lncc"))),
+)
+
+Case = tuple[int, int, int, str]
+
+
+def run(case: Case) -> int:
+    """Register one case in this process and return the peak of its resident memory in bytes."""
+    import resource
+
+    import torch
+
+    from torchdeform.cli import main as register
+    from torchdeform.grid import Grid
+    from torchdeform.image import Image
+    from torchdeform.io import write_image
+
+    dim, n, channels, similarity = case
+    torch.manual_seed(0)
+    coarse = torch.rand(1, channels, *[n // 8] * dim)
+    mode = {2: "bilinear", 3: "trilinear"}[dim]
+    data = torch.nn.functional.interpolate(coarse, size=(n,) * dim, mode=mode)
+    choices = ("--set", "steps=[1, 1, 2]", "--set", f"similarity={similarity}", "--device", "cpu", "--quiet")
+    with tempfile.TemporaryDirectory() as folder:
+        names = [Path(folder) / f"{name}.nrrd" for name in ("fixed", "moving")]
+        for name, shift in zip(names, (0, 1), strict=True):
+            write_image(Image(data.roll(shift, 2), Grid((n,) * dim)), name)
+        del data
+        if register([*map(str, names), "--out", f"{folder}/out", *choices]):
+            raise SystemExit(f"{case} could not be registered")
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def measure(case: Case) -> int:
+    """Return the peak of a fresh process that registers one case, in bytes."""
+    command = [sys.executable, str(Path(__file__)), "--case", json.dumps(case)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    return int(done.stdout.split()[-1])
+
+
+def estimated(case: Case) -> int:
+    """Return what the package expects of a case, in bytes."""
+    from torchdeform.grid import Grid
+    from torchdeform.memory import estimate
+
+    dim, n, channels, similarity = case
+    return estimate(Grid((n,) * dim), channels=channels, similarity=similarity)
+
+
+def main() -> None:
+    """Print a line a case."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="two small cases only")
+    parser.add_argument("--case", type=json.loads, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.case:
+        print(run(tuple(arguments.case)))
+        return
+    for case in QUICK if arguments.quick else CASES:
+        found, expected = measure(case), estimated(case)
+        print(f"{case!s:24} measured {found / 1e6:8.1f} MB  expected {expected / 1e6:8.1f} MB  {expected / found:.2f}")
+
+
+if __name__ == "__main__":
+    main()

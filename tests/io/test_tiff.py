@@ -1,0 +1,130 @@
+"""TIFF: pages, channels, numbers of any width, and the spacing that programs leave in tags."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchdeform.errors import InputError
+from torchdeform.grid import Grid
+from torchdeform.image import Image
+from torchdeform.io import read_image, write_image
+
+tifffile = pytest.importorskip("tifffile")
+PIL = pytest.importorskip("PIL.Image")
+
+
+def values(shape, kind="uint16"):
+    top = np.iinfo(kind).max if np.dtype(kind).kind in "ui" else 1.0
+    return (np.random.default_rng(0).random(shape) * top).astype(kind)
+
+
+@pytest.mark.parametrize("kind", ["uint8", "uint16", "int16", "uint32", "float32", "float64"])
+@pytest.mark.parametrize("shape", [(20, 30), (5, 20, 30)])
+def test_pages_are_a_volume_in_any_number(tmp_path, shape, kind):
+    pixels = values(shape, kind)
+    tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="minisblack")
+    image = read_image(tmp_path / "a.tif")
+    assert (image.grid.shape, image.pixel_type) == (shape, kind)
+    assert np.array_equal(image.data[0, 0].numpy(), pixels.astype(np.float32))
+
+
+@pytest.mark.parametrize("compression", [None, "tiff_lzw", "packbits", "tiff_adobe_deflate"])
+def test_compressions_are_read(tmp_path, compression):
+    pixels = values((20, 30), "uint8")
+    PIL.fromarray(pixels).save(tmp_path / "a.tif", compression=compression)
+    assert np.array_equal(read_image(tmp_path / "a.tif").data[0, 0].numpy(), pixels)
+
+
+def test_jpeg_inside_is_read_in_colour(tmp_path):
+    pixels = np.kron(values((5, 6, 3), "uint8"), np.ones((8, 8, 1), np.uint8))
+    PIL.fromarray(pixels).save(tmp_path / "a.tif", compression="jpeg", quality=95)
+    image = read_image(tmp_path / "a.tif")
+    assert image.data.shape == (1, 3, 40, 48)
+    assert np.abs(image.data[0].numpy() - np.moveaxis(pixels, -1, 0)).mean() < 20
+
+
+@pytest.mark.parametrize(("unit", "millimetres"), [("mm", 1.0), ("um", 1e-3), ("micron", 1e-3), ("cm", 10.0)])
+def test_imagej_says_the_spacing(tmp_path, unit, millimetres):
+    where = {"axes": "ZYX", "spacing": 2.5, "unit": unit}
+    tifffile.imwrite(
+        tmp_path / "a.tif", values((5, 20, 30)), imagej=True, resolution=(1 / 0.5, 1 / 0.25), metadata=where
+    )
+    spacing = read_image(tmp_path / "a.tif").grid.spacing
+    np.testing.assert_allclose(spacing, np.array([2.5, 0.25, 0.5]) * millimetres, rtol=1e-6)
+
+
+def test_ome_says_the_spacing(tmp_path):
+    sizes = {"PhysicalSizeX": 0.5, "PhysicalSizeY": 0.25, "PhysicalSizeZ": 2.0}
+    units = {f"{key}Unit": "µm" for key in sizes}
+    tifffile.imwrite(tmp_path / "a.ome.tif", values((5, 20, 30)), metadata={"axes": "ZYX"} | sizes | units)
+    np.testing.assert_allclose(read_image(tmp_path / "a.ome.tif").grid.spacing, (2e-3, 0.25e-3, 0.5e-3))
+
+
+@pytest.mark.parametrize(("unit", "size"), [("INCH", 25.4 / 300), ("CENTIMETER", 10 / 300), ("NONE", 1.0)])
+def test_resolution_tags_say_the_spacing(tmp_path, unit, size):
+    tifffile.imwrite(tmp_path / "a.tif", values((20, 30)), resolution=(300, 300), resolutionunit=unit)
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif").grid.spacing, (size, size))
+
+
+@pytest.mark.parametrize(
+    ("axes", "shape"),
+    [("ZCYX", (5, 2, 20, 30)), ("CYX", (2, 20, 30)), ("TZCYX", (1, 5, 2, 20, 30)), ("ZYXS", (5, 20, 30, 3))],
+)
+def test_channels_are_channels(tmp_path, axes, shape):
+    pixels = values(shape, "uint8" if "S" in axes else "uint16")
+    tifffile.imwrite(tmp_path / "a.tif", pixels, imagej=True, metadata={"axes": axes})
+    wanted = np.moveaxis(pixels, axes.find("C") if "C" in axes else axes.find("S"), 0)
+    got = read_image(tmp_path / "a.tif").data[0].numpy()
+    assert np.array_equal(got, wanted.reshape(got.shape))
+
+
+def test_planes_of_colour_and_colour_tables(tmp_path):
+    colour = values((3, 20, 30))
+    tifffile.imwrite(tmp_path / "planes.tif", colour, photometric="rgb", planarconfig="separate")
+    assert np.array_equal(read_image(tmp_path / "planes.tif").data[0].numpy(), colour)
+    table = PIL.fromarray(np.moveaxis(values((3, 20, 30), "uint8"), 0, -1)).quantize(16)
+    table.save(tmp_path / "table.tif")
+    wanted = np.moveaxis(np.asarray(table.convert("RGB")), -1, 0)
+    assert np.array_equal(read_image(tmp_path / "table.tif").data[0].numpy(), wanted)
+
+
+@pytest.mark.parametrize(("kind", "channels"), [("uint8", 1), ("uint8", 3), ("uint16", 2), ("float32", 1)])
+def test_volumes_keep_their_spacing(tmp_path, kind, channels):
+    data = torch.from_numpy(values((1, channels, 5, 20, 30), kind).astype(np.float32))
+    image = Image(data, Grid((5, 20, 30), (2.5, 0.25, 0.5)), pixel_type=kind)
+    write_image(image, tmp_path / "a.tif")
+    back = read_image(tmp_path / "a.tif")
+    assert torch.equal(back.data, data)
+    assert back.pixel_type == kind
+    np.testing.assert_allclose(back.grid.spacing, image.grid.spacing, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (lambda p: tifffile.imwrite(p, values((3, 5, 20, 30)), imagej=True, metadata={"axes": "TZYX"}), "series of 3"),
+        (lambda p: tifffile.imwrite(p, values((20, 30), "float32").astype("c8")), "complex"),
+        (lambda p: tifffile.imwrite(p, values((1, 300))), "at least two axes"),
+        (lambda p: p.write_bytes(b"II*\0" + bytes(100)), "damaged"),
+    ],
+)
+def test_what_is_no_image_is_refused(tmp_path, capfd, write, message):
+    write(tmp_path / "a.tif")
+    with pytest.raises(InputError, match=message) as error:
+        read_image(tmp_path / "a.tif")
+    assert "a.tif" in str(error.value)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9, 0.99])
+def test_missing_pages_are_noticed(tmp_path, capfd, share):
+    """A file with fewer pages than it was written with is refused, not read as a thinner volume."""
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for page in values((6, 20, 30)):
+            file.write(page, contiguous=False)
+    assert read_image(tmp_path / "a.tif").grid.shape == (6, 20, 30)
+    content = (tmp_path / "a.tif").read_bytes()
+    (tmp_path / "a.tif").write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(InputError, match="damaged or incomplete"):
+        read_image(tmp_path / "a.tif")
+    assert capfd.readouterr() == ("", "")

@@ -1,0 +1,166 @@
+"""Symmetric registration: swapping the images inverts the map; nothing else gets worse."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from pictures import bend, blobs, disc
+from torch import Tensor
+
+from torchdeform.errors import InputError
+from torchdeform.grid import Grid
+from torchdeform.image import Image, resample
+from torchdeform.registration.deformable import register
+from torchdeform.registration.evaluation import carry_points
+from torchdeform.registration.guidance import Guidance
+from torchdeform.registration.placing import moved
+from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.steps import lowest_determinant, mended
+from torchdeform.registration.symmetric import common_axes, middle_frame, root
+from torchdeform.transform import Affine
+from torchdeform.warp import compose, max_voxels, voxels, warp
+
+SYMMETRIC = RegistrationSettings(steps=(30, 20, 10), length=6.0, window=7, symmetric=True, align="none")
+
+
+@pytest.mark.parametrize("shape", [(64, 80), (28, 26, 32)])
+@pytest.mark.parametrize("similarity", ["lncc", "ssd", "mi", "ngf", "mind"])
+def test_swapping_the_images_inverts_the_map(shape, similarity):
+    grid, moving = Grid(shape), blobs(shape, 1)
+    fixed = warp(moving, bend(grid, 3.0), grid)
+    settings = replace(SYMMETRIC, similarity=similarity)
+    there, back = register(fixed, moving, settings), register(moving, fixed, settings)
+    assert max_voxels(there.displacement, grid).item() > 1.5
+    for apart in (there.inverse - back.displacement, compose(there.displacement, back.displacement, grid)):
+        distance = voxels(apart, grid)
+        assert distance.mean() < (0.1 if similarity == "mind" else 0.05)  # MIND bends small volumes most
+        assert distance.flatten().quantile(0.9) < 0.15
+    assert torch.equal(there.levels[-1].similarity[-1], back.levels[-1].similarity[-1])  # mirrored to the last bit
+
+
+def test_swapping_images_that_have_nothing_in_common_inverts_the_map():
+    shape = (64, 64)
+    there, back = (register(blobs(shape, i), blobs(shape, 3 - i), SYMMETRIC) for i in (1, 2))
+    assert there.diagnosis.folds.item() == back.diagnosis.folds.item() == 0
+    assert voxels(there.inverse - back.displacement, there.grid).mean() < 0.1
+
+
+def test_swapping_with_masks_and_landmarks_inverts_the_map():
+    shape = (56, 48)
+    grid, moving = Grid(shape), blobs(shape, 1)
+    fixed = warp(moving, bend(grid, 3.0), grid)
+    points, ends = (
+        torch.tensor([[[20.0, 30.0, 25.0], [15.0, 20.0, 33.0]]]),
+        torch.tensor([[[21.0, 28.0], [14.0, 22.0]]]),
+    )
+    ends = torch.cat([ends, torch.tensor([[[25.0], [35.0]]])], dim=2)
+    masks = disc(shape, (26, 24), 20), disc(shape, (28, 26), 22)
+    settings = replace(SYMMETRIC, points_weight=0.1)
+    there = register(
+        fixed,
+        moving,
+        settings,
+        guidance=Guidance(fixed_mask=masks[0], moving_mask=masks[1], fixed_points=points, moving_points=ends),
+    )
+    back = register(
+        moving,
+        fixed,
+        settings,
+        guidance=Guidance(fixed_mask=masks[1], moving_mask=masks[0], fixed_points=ends, moving_points=points),
+    )
+    assert voxels(there.inverse - back.displacement, grid).mean() < 0.02
+    assert voxels(there.inverse - back.displacement, grid).max() < 0.2
+
+
+@pytest.mark.parametrize("shape", [(64, 80), (28, 26, 32)])
+def test_a_known_map_is_found_as_well_as_without(shape):
+    grid, moving = Grid(shape), blobs(shape, 1)
+    truth = bend(grid, 3.0)
+    fixed = warp(moving, truth, grid)
+    inside = (..., *[slice(4, -4)] * grid.dim)
+    errors = []
+    for symmetric in (False, True):
+        u = register(fixed, moving, replace(SYMMETRIC, symmetric=symmetric)).displacement
+        errors.append(float((u - truth).square().sum(1).sqrt()[inside].mean()))
+    assert errors[1] < 1.2 * errors[0] + 0.02
+
+
+def tilt(degrees: float) -> tuple[tuple[float, ...], ...]:
+    a = math.radians(degrees)
+    return ((math.cos(a), -math.sin(a)), (math.sin(a), math.cos(a)))
+
+
+def test_swapping_images_on_different_grids_inverts_the_map():
+    wide = Image(blobs((130, 140), 1), Grid((130, 140), (0.8, 0.8)), (-10.0, -5.0))
+    affine = Affine(torch.tensor([[1.05, 0.15], [-0.12, 0.97]]).double(), torch.tensor([7.0, -4.0]).double())
+    bent = replace(wide, data=warp(wide.data, bend(wide.grid, 4.0), wide.grid))
+    fixed = Image(torch.zeros(1, 1, 64, 72), Grid((64, 72)), (4.0, 14.0), tilt(-6))
+    moving = Image(torch.zeros(1, 1, 66, 78), Grid((66, 78), (1.05, 0.9)), (16.0, 10.0), tilt(5))
+    fixed = replace(fixed, data=resample(bent, fixed, outside=None).float())
+    moving = replace(moving, data=resample(moved(wide, affine), moving, outside=None).float())
+    there = register(fixed, moving, SYMMETRIC, affine=affine)
+    back = register(moving, fixed, SYMMETRIC, affine=affine.inverse())
+    x, y = torch.meshgrid(torch.linspace(25, 60, 9), torch.linspace(26, 60, 9), indexing="ij")
+    points = torch.stack([x.flatten(), y.flatten()]).unsqueeze(0).double()
+    ends = carry_points(points, fixed, affine, there.displacement)
+    returned = carry_points(ends, moving, affine.inverse(), back.displacement)
+    apart = (returned - points).norm(dim=1)
+    assert (ends - affine(points)).norm(dim=1).mean() > 1
+    assert apart.mean() < 0.05
+    assert apart.quantile(0.9) < 0.1
+
+
+def test_the_space_between_does_not_depend_on_the_order():
+    first = Image(torch.zeros(1, 1, 20, 30), Grid((20, 30), (2.0, 1.0)), (3.0, -4.0), tilt(3))
+    second = Image(torch.zeros(1, 1, 40, 25), Grid((40, 25), (0.8, 1.5)), (0.0, 2.0), tilt(-4))
+    axes = common_axes(first, second)
+    assert axes == common_axes(second, first) == ((1.0, 0.0), (0.0, 1.0))
+    one, other = middle_frame(first, second, axes), middle_frame(second, first, axes)
+    assert one.grid.shape == other.grid.shape
+    assert one.grid.spacing == pytest.approx(other.grid.spacing, rel=1e-12)
+    assert one.origin == pytest.approx(other.origin, abs=1e-9)
+    same = middle_frame(first, first, common_axes(first, first))
+    assert same.grid.shape == first.grid.shape
+    assert same.origin == pytest.approx(first.origin, abs=1e-6)
+    far = replace(second, origin=(500.0, 0.0))
+    with pytest.raises(InputError, match="too little in common"):
+        middle_frame(first, far, axes)
+
+
+def test_the_root_of_an_affine_map_makes_it_when_it_is_applied_twice():
+    generator = torch.Generator().manual_seed(0)
+    for dim in (2, 3):
+        matrix = torch.eye(dim).double() + 0.3 * torch.randn(dim, dim, generator=generator).double()
+        affine = Affine(matrix, torch.randn(dim, generator=generator).double() * 50)
+        half, back = root(affine), root(affine.inverse())
+        torch.testing.assert_close(half.then(half).matrix, affine.matrix)
+        torch.testing.assert_close(half.then(half).offset, affine.offset)
+        torch.testing.assert_close(half.inverse().matrix, back.matrix)
+        torch.testing.assert_close(half.inverse().offset, back.offset)
+    for matrix in (torch.diag(torch.tensor([-1.0, 1.0])), -torch.eye(2)):
+        with pytest.raises(InputError, match="mirroring or a turn by 180"):
+            root(Affine(matrix.double(), torch.zeros(2).double()))
+
+
+def folded(shape: tuple[int, ...]) -> Tensor:
+    """A gentle map with one node out of place."""
+    u = bend(Grid(shape), 2.0)
+    u[(0, slice(None), *(n // 2 for n in shape))] += 3.0
+    return u
+
+
+@pytest.mark.parametrize("shape", [(20, 24), (14, 16, 12)])
+def test_mending_opens_folds_and_leaves_the_rest_alone(shape):
+    grid, u = Grid(shape), folded(shape)
+    assert (lowest_determinant(u, grid) < 0).any()
+    both = mended(torch.cat([u, bend(grid, 2.0)]), grid, 0.03)
+    assert (lowest_determinant(both, grid) > 0.03).all()
+    changed = ((both[:1] - u).abs() > 0).any(1)
+    assert changed.sum() < 9**grid.dim
+    assert torch.equal(both[1:], bend(grid, 2.0))
+    edge = torch.zeros(1, grid.dim, *shape)
+    edge[(0, slice(1, None), 0, *(n // 2 for n in shape[1:]))] = 3.0  # along the face, which it must not leave
+    flat = mended(edge, grid)
+    assert (lowest_determinant(flat, grid) > 0).all()
+    assert (flat[:, 0, 0] == 0).all()

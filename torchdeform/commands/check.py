@@ -1,0 +1,92 @@
+"""``check``: what two images are, what looks wrong with them, and a picture of where they lie."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from torchdeform.check import ERROR, is_oblique, orientation, preflight
+from torchdeform.errors import InputError, require_choice
+from torchdeform.image import Image
+from torchdeform.io import read_image
+from torchdeform.io.files import staged, suffix
+from torchdeform.registration.affine_group import KINDS
+from torchdeform.report.overlay import write_overlay
+
+Fixed = Annotated[
+    Path, typer.Argument(metavar="FIXED", help="Image that shall stay: a file, or a folder with a DICOM series.")
+]
+Moving = Annotated[Path, typer.Argument(metavar="MOVING", help="Image that shall be warped onto it.")]
+FixedMask = Annotated[
+    Path | None, typer.Option(metavar="FILE", show_default="none", help="Where FIXED counts (not 0).")
+]
+MovingMask = Annotated[
+    Path | None, typer.Option(metavar="FILE", show_default="none", help="Where MOVING counts (not 0).")
+]
+Picture = Annotated[
+    Path | None, typer.Option("--out", metavar="PICTURE.png", show_default="none", help="Write an overlay picture.")
+]
+Align = Annotated[str, typer.Option(metavar="KIND", help=f"Alignment that shall come first: {', '.join(KINDS)}.")]
+
+
+def check(
+    fixed: Fixed,
+    moving: Moving,
+    fixed_mask: FixedMask = None,
+    moving_mask: MovingMask = None,
+    align: Align = "affine",
+    out: Picture = None,
+) -> None:
+    """Say what FIXED and MOVING are and what looks wrong with them, before they are registered. Nothing is moved.
+
+    Orientations name where x, y and z point to: LPS is left, posterior, superior. Exit code 2 if there is an error.
+    Example: torchdeform check fixed.nii.gz moving.nii.gz --out overlay.png
+    """
+    require_choice(align, KINDS, "--align")
+    if out is not None and suffix(out) != ".png":
+        raise InputError(f"--out {out}: the picture is a PNG; let its name end in .png")
+    images = read_image(fixed), read_image(moving)
+    masks = [None if path is None else read_image(path) for path in (fixed_mask, moving_mask)]
+    report = preflight(*images, fixed_mask=masks[0], moving_mask=masks[1], aligned=align != "none")
+    typer.echo(side_by_side(*images))
+    for finding in report.findings:
+        typer.echo(f"{finding.severity}: {finding.text}")
+    if not report.findings:
+        typer.echo("nothing looks wrong")
+    if out is not None:
+        _draw(out, *images)
+    if report.of(ERROR):
+        raise typer.Exit(2)
+
+
+def side_by_side(fixed: Image, moving: Image) -> str:
+    """Return what two images are, a property a line."""
+    columns = [{"": name, **_properties(image)} for name, image in (("fixed", fixed), ("moving", moving))]
+    widths = [max(len(text) for text in column.values()) for column in columns]
+    left = max(map(len, columns[0]))
+    rows = (
+        f"{name:<{left}}  " + "  ".join(f"{c[name]:<{w}}" for c, w in zip(columns, widths, strict=True))
+        for name in columns[0]
+    )
+    return "\n".join(row.rstrip() for row in rows)
+
+
+def _properties(image: Image) -> dict[str, str]:
+    low, high = (float(end) for end in image.data.aminmax())
+    return {
+        "file": image.name,
+        "size": " × ".join(map(str, image.grid.shape[::-1])),
+        "spacing (mm)": " × ".join(f"{h:.4g}" for h in image.grid.spacing[::-1]),
+        "origin (mm)": ", ".join(f"{x:.5g}" for x in image.origin),
+        "orientation": orientation(image) + (" (oblique)" if is_oblique(image) else ""),
+        "intensities": f"{low:.5g} to {high:.5g}, {image.pixel_type}",
+        "channels": str(image.data.shape[1]),
+    }
+
+
+def _draw(out: Path, fixed: Image, moving: Image) -> None:
+    if fixed.grid.dim != moving.grid.dim:
+        return
+    with staged(out.parent) as folder:
+        write_overlay(folder / out.name, fixed, moving)
+    typer.echo(f"picture: {out}")

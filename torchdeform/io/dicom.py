@@ -1,0 +1,246 @@
+"""DICOM: one file, the series that a file belongs to, or a folder that holds one series; what is missing is named."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchdeform.errors import InputError
+from torchdeform.image import Image
+from torchdeform.io import itk
+from torchdeform.io.complaints import BROKEN_OFF
+from torchdeform.io.files import beginning
+
+if TYPE_CHECKING:
+    import SimpleITK as sitk
+
+# One file stands for its series when there are at least so many slices: fewer cannot be registered as a volume.
+VOLUME_SLICES = 8
+
+_MAGIC = 128, b"DICM"
+_UNEVEN = 0.1  # distances of neighbouring slices may differ by this share of a step
+_SHEAR = 0.01  # and slices may be shifted sideways by this share of a step
+_SAME = 1e-2  # mm; slices nearer than this are at the same place
+
+_POSITION, _SERIES, _TITLE, _FRAME_TIME = "0020|0032", "0020|000e", "0008|103e", ("0018|1063", "0018|1065")
+_MOMENT = ("0018|1060", "0008|0032")  # trigger time, acquisition time
+_PARTS = ("0018|0086", "0020|0100")  # echo, moment: what tells several volumes of one series apart
+
+# Kinds of DICOM files that hold no image: directories, presentation states, reports, documents, plans, raw data.
+_NO_IMAGE = re.compile(rb"1\.2\.840\.10008\.(1\.3\.10|5\.1\.4\.1\.1\.(11|88|104|66|481\.[3458])(\.|\0|$))")
+
+
+@dataclass(frozen=True)
+class Slice:
+    """What the header of one file tells.
+
+    Attributes:
+        path: the file.
+        series: what all slices of one volume share.
+        title: the series' description.
+        size: pixels along x, y and z.
+        position: world position of the first pixel, mm.
+        moment: when it was taken, as the header writes it.
+        axes: world directions of x, y and z as columns ``(3, 3)``.
+        film: whether the frames of this file follow each other in time.
+        grey: whether pixels have one number.
+    """
+
+    path: Path
+    series: tuple[object, ...]
+    title: str
+    size: tuple[int, ...]
+    position: NDArray[np.float64]
+    moment: tuple[str, ...]
+    axes: NDArray[np.float64]
+    film: bool
+    grey: bool
+
+    @property
+    def height(self) -> float:
+        """Position along the normal of the slice, mm."""
+        return float(self.axes[:, 2] @ self.position)
+
+
+def is_dicom(path: Path) -> bool:
+    """Return whether a file begins like DICOM, whatever its name."""
+    start, magic = _MAGIC
+    return beginning(path, start + len(magic))[start:] == magic
+
+
+def read_file(path: Path) -> Image:
+    """Read a DICOM file: the volume of its series, or the file alone where the series is no volume.
+
+    Args:
+        path: one file.
+
+    Raises:
+        InputError: damaged, a film, or of a series with slices that are missing, doubled, uneven or sheared.
+
+    Notes:
+        The series is what lies in the same folder with the same series number, size, orientation and spacing. It is
+        no volume when it has fewer than 8 slices, or several frames at one position, as a beating heart has. To read
+        one slice of a volume, put it into a folder of its own.
+    """
+    here = _header(path)
+    if here is None:
+        raise InputError(f"{path} holds no DICOM image; give an image file, or the folder of the series")
+    if here.film:
+        raise InputError(f"{path} is a film of {here.size[2]} frames; export one frame and give that")
+    if here.size[2] > 1 or _has_frames(series := _like(here)) or len(series) < VOLUME_SLICES:
+        return itk.to_image(_load(path), str(path))
+    return _volume(series, str(path))
+
+
+def read_folder(folder: Path) -> Image:
+    """Read the one DICOM series in a folder.
+
+    Args:
+        folder: where the files are; what is no DICOM image is passed over.
+
+    Raises:
+        InputError: no series or several, a series of several frames, or slices that do not make a volume.
+    """
+    groups: dict[tuple[object, ...], list[Slice]] = {}
+    for found in _headers(folder):
+        groups.setdefault(found.series, []).append(found)
+    if not groups:
+        raise InputError(f"{folder} is a folder without DICOM images{_below(folder)}; give an image file")
+    if len(groups) > 1:
+        titles = ", ".join(f"'{g[0].title}' ({len(g)} files, {g[0].path.name} for one)" for g in groups.values())
+        raise InputError(f"{folder} holds {len(groups)} DICOM series: {titles}; give one file of the series wanted")
+    (series,) = groups.values()
+    if len(series) == 1:
+        return read_file(series[0].path)
+    if _has_frames(series):
+        places = len(_steps(series)) + 1
+        raise InputError(
+            f"{folder} is a DICOM series over time, {len(series)} frames at {places} positions; give one of its files, "
+            "or a folder with the files of one moment"
+        )
+    return _volume(series, str(folder))
+
+
+def _below(folder: Path) -> str:
+    names = [path.name for path in sorted(folder.iterdir()) if path.is_dir()][:3]
+    return f" (it has the folders {', '.join(names)})" if names else ""
+
+
+def _like(one: Slice) -> list[Slice]:
+    return [found for found in _headers(one.path.parent) if found.series == one.series]
+
+
+def _headers(folder: Path) -> list[Slice]:
+    files = [path for path in sorted(folder.iterdir()) if path.is_file() and is_dicom(path)]
+    return [header for header in map(_header, files) if header is not None]
+
+
+def _header(path: Path) -> Slice | None:
+    """Return what the header says, or None for DICOM files that hold no image."""
+    import SimpleITK as sitk
+
+    if _NO_IMAGE.search(beginning(path, 2048)):
+        return None
+    reader = sitk.ImageFileReader()
+    reader.SetImageIO("GDCMImageIO")
+    reader.SetFileName(str(path))
+    error = itk.quietly(reader.ReadImageInformation)
+    if isinstance(error, RuntimeError):
+        raise InputError(f"{path} {BROKEN_OFF}") from error
+    return _slice(path, reader)
+
+
+def _slice(path: Path, reader: "sitk.ImageFileReader") -> Slice:
+    tags = {tag: reader.GetMetaData(tag).strip() for tag in reader.GetMetaDataKeys()}
+    axes = np.array(reader.GetDirection()).reshape(3, 3)
+    spacing = reader.GetSpacing()[:2]
+    alone = path.name if reader.GetSize()[2] > 1 else ""
+    alike = (alone, *reader.GetSize(), *np.round(axes[:, :2], 3).ravel() + 0.0, *np.round(spacing, 4))
+    return Slice(
+        path=path,
+        series=(tags.get(_SERIES, ""), *(tags.get(tag, "") for tag in _PARTS), *alike),
+        title=tags.get(_TITLE, "without a name"),
+        size=reader.GetSize(),
+        position=np.array(reader.GetOrigin()),
+        moment=tuple(tags.get(tag, "") for tag in _MOMENT),
+        axes=axes,
+        film=reader.GetSize()[2] > 1 and any(tag in tags for tag in _FRAME_TIME),
+        grey=reader.GetNumberOfComponents() == 1,
+    )
+
+
+def _sorted(series: Sequence[Slice]) -> list[Slice]:
+    return sorted(series, key=lambda s: (s.height, s.path.name))
+
+
+def _steps(series: Sequence[Slice]) -> NDArray[np.float64]:
+    """Return the distances between neighbouring positions that differ, mm."""
+    steps = np.diff([s.height for s in _sorted(series)])
+    return steps[steps > _SAME]
+
+
+def _has_frames(series: Sequence[Slice]) -> bool:
+    """Return whether positions repeat at different moments, or half again as many files as positions: no slip."""
+    again = [(one, two) for one, two in pairwise(_sorted(series)) if two.height - one.height <= _SAME]
+    return any(one.moment != two.moment for one, two in again) or len(series) >= 1.5 * (len(_steps(series)) + 1)
+
+
+def _volume(series: Sequence[Slice], name: str) -> Image:
+    """Read the slices of one volume, its third axis being the normal of the slices."""
+    import SimpleITK as sitk
+
+    slices = _sorted(series)
+    step = _require_regular(slices, name)
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames([str(s.path) for s in slices])
+    reader.SetImageIO("GDCMImageIO")
+    if slices[0].grey:  # each slice may have its own scale, and what the first one is stored in may not hold the others
+        reader.SetOutputPixelType(sitk.sitkFloat32)
+    image = itk.quietly(reader.Execute)
+    if isinstance(image, RuntimeError):
+        for slice_ in slices:
+            _load(slice_.path)
+        raise InputError(f"{name} cannot be read ({itk.reason(image)}); export the series again") from image
+    image.SetOrigin(slices[0].position.tolist())
+    image.SetDirection(slices[0].axes.ravel().tolist())
+    image.SetSpacing((*image.GetSpacing()[:2], step))
+    return itk.to_image(image, name)
+
+
+def _load(path: Path) -> "sitk.Image":
+    try:
+        return itk.load(path)
+    except RuntimeError as error:
+        raise InputError(f"{path} {BROKEN_OFF}") from error
+
+
+def _require_regular(slices: Sequence[Slice], name: str) -> float:
+    """Return the distance of the slices, `InputError` naming what does not fit."""
+    pairs = list(pairwise(slices))
+    steps = np.array([after.height - before.height for before, after in pairs])
+    for (before, after), gap in zip(pairs, steps, strict=True):
+        if gap <= _SAME:
+            names = f"{before.path.name} and {after.path.name}"
+            raise InputError(f"{name}: {names} are slices at the same place; remove one of them")
+    step = float(np.median(steps))
+    for (before, after), gap in zip(pairs, steps, strict=True):
+        between = f"between {before.path.name} and {after.path.name}"
+        if gap > 1.5 * step:
+            count = round(gap / step) - 1
+            raise InputError(f"{name}: {count} slices are missing {between}; fetch the whole series again")
+        if abs(gap - step) > _UNEVEN * step:
+            uneven = f"{gap:.3g} mm {between}, {step:.3g} mm elsewhere"
+            raise InputError(f"{name}: its slices are unevenly spaced ({uneven}); resample it to even slices first")
+    path = slices[-1].position - slices[0].position
+    aside = np.linalg.norm(slices[0].axes[:, :2].T @ path) / len(pairs)
+    if aside > _SHEAR * step:
+        raise InputError(
+            f"{name}: its slices are shifted sideways by {aside:.2g} mm each (a tilted gantry), so its axes are not at "
+            "right angles; reslice it onto a rectangular grid first"
+        )
+    return float(slices[-1].height - slices[0].height) / len(pairs)

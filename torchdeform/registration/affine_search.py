@@ -1,0 +1,141 @@
+"""The coarse search of an alignment: all starts tried, the best climbed, mirror images looked at."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchdeform.registration.affine_climb import climb
+from torchdeform.registration.affine_group import angle, generators
+from torchdeform.registration.affine_level import Level
+from torchdeform.registration.affine_starts import Start, body, make_starts
+
+# Starts that are climbed, and those of them that go on to the next level.
+_CLIMBED = 10
+_KEPT = 3
+
+# Maps nearer to each other than this (norm of the difference of their matrices) count as one.
+_SAME_START = 0.3
+_SAME_END = 0.05
+
+# A map that turns further than this many degrees has to be better than the others by this share.
+_TURNED = 45.0
+_TURNED_GAIN = 1.1
+
+# A mirror image has to be better by this share before it is mentioned.
+_MIRROR_GAIN = 1.2
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A map on its way to the alignment.
+
+    Attributes:
+        name: the start it comes from.
+        map: matrix ``(D + 1, D + 1)`` in the coordinates of the `Frame`.
+        value: its similarity on the last level.
+    """
+
+    name: str
+    map: Tensor
+    value: float
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the coarse search found.
+
+    Attributes:
+        candidates: the best maps, the best first.
+        mirror: how much better a mirrored map is than the best one, in its distance from what chance gives; 1 is
+            equally good.
+    """
+
+    candidates: list[Candidate]
+    mirror: float = 0.0
+
+    @property
+    def size(self) -> float:
+        """How much larger things are in the moving image, by the best map; 1 without one."""
+        if not self.candidates:
+            return 1.0
+        linear = self.candidates[0].map[:-1, :-1]
+        return float(torch.linalg.det(linear)) ** (1 / len(linear))
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether a mirrored map is clearly better."""
+        return self.mirror > _MIRROR_GAIN
+
+
+def climbed(level: Level, candidates: Sequence[Candidate], moves: Tensor, steps: int) -> list[Candidate]:
+    """Return the candidates after climbing a level, the most similar first."""
+    maps, values = climb(level, torch.stack([c.map for c in candidates]), moves, steps=steps)
+    moved = [Candidate(c.name, m, float(v)) for c, m, v in zip(candidates, maps, values, strict=True)]
+    return sorted(moved, key=lambda c: -c.value)
+
+
+def search(level: Level, kind: str, *, turn: bool, steps: int) -> Found:
+    """Return the best maps that starts at the files' geometry, the centres, the moments and rotations lead to.
+
+    Args:
+        level: the coarsest level.
+        kind: ``translation`` to ``affine``; ``affine`` is searched as ``similarity``.
+        turn: try rotations, and mirror images.
+        steps: evaluations at most.
+
+    Notes:
+        Merit is (S − median of S over all starts) · overlap: what is common to bad maps does not count, and a little
+        overlap is worth little. A map that turns by more than 45° is taken only when its merit is 1.1 times that of
+        all that turn less.
+    """
+    rough = "similarity" if kind == "affine" else kind
+    bodies = body(level.fixed, level.frame), body(level.moving, level.frame)
+    plain, chance = _try(level, make_starts(*bodies, turn=turn, scale=rough == "similarity"), rough, steps)
+    if not turn or not plain:
+        return Found(_best(plain, chance))
+    mirrored, _ = _try(level, make_starts(*bodies, turn=True, scale=rough == "similarity", mirror=True), rough, steps)
+    tops = [max((c.value - chance for c in side), default=0.0) for side in (mirrored, plain)]
+    return Found(_best(plain, chance), tops[0] / max(tops[1], 1e-12))
+
+
+def _try(level: Level, starts: list[Start], kind: str, steps: int) -> tuple[list[Candidate], float]:
+    """Return where the most promising starts lead, their merit as value plus what chance gives, and that."""
+    maps = torch.stack([start.map for start in starts])
+    value, shared = level.values(maps)
+    finite = value.isfinite()
+    if not bool(finite.any()):
+        return [], 0.0
+    chance = float(value[finite].median())
+    merit = (value - chance) * shared.clamp(max=1.0)
+    chosen = _promising(starts, maps, merit)
+    ends = climbed(level, [Candidate(starts[i].name, maps[i], 0.0) for i in chosen], generators(kind, level.dim), steps)
+    value, shared = level.values(torch.stack([c.map for c in ends]))
+    merit = chance + (value - chance) * shared.clamp(max=1.0)
+    return [replace(c, value=float(m)) for c, m in zip(ends, merit, strict=True)], chance
+
+
+def _promising(starts: list[Start], maps: Tensor, merit: Tensor) -> list[int]:
+    """Return the starts to climb: all without a rotation, then the best of the others that are not alike."""
+    chosen = [i for i, start in enumerate(starts) if not start.turned and merit[i] > -torch.inf]
+    for i in merit.argsort(descending=True, stable=True).tolist():
+        alone = all(float((maps[i] - maps[j]).norm()) >= _SAME_START for j in chosen)
+        if alone and merit[i] > -torch.inf and len(chosen) < _CLIMBED:
+            chosen.append(i)
+    return chosen
+
+
+def _best(candidates: list[Candidate], chance: float) -> list[Candidate]:
+    """Return a few candidates that differ, by merit, which counts for less where a map turns far."""
+
+    def merit(candidate: Candidate) -> float:
+        gain = candidate.value - chance
+        return gain / _TURNED_GAIN if float(angle(candidate.map[:-1, :-1])) > _TURNED else gain
+
+    kept: list[Candidate] = []
+    for candidate in sorted(candidates, key=merit, reverse=True):
+        alone = all(float((candidate.map - other.map).norm()) >= _SAME_END for other in kept)
+        if alone and candidate.value > -torch.inf and len(kept) < _KEPT:
+            kept.append(candidate)
+    return kept

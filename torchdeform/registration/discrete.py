@@ -1,0 +1,300 @@
+"""A start for large motion: every displacement within reach is tried at every control point, then made one flow."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchdeform.errors import InputError
+from torchdeform.fem.form import Row, Term
+from torchdeform.fem.operator import assemble_load
+from torchdeform.fem.spectral import TransformSolver
+from torchdeform.fem.weights import Weights
+from torchdeform.flow import integrate
+from torchdeform.grid import Grid
+from torchdeform.registration.metrics.mind import mind_ssc
+from torchdeform.registration.pyramid import MIN_NODES, prolong, pyramid_grids, restrict
+from torchdeform.registration.steps import mended
+from torchdeform.solvers.transforms import inverse_transform, transform
+from torchdeform.warp import compose, warp
+
+# Rounds in which the two directions are made inverse to each other, and in which a velocity is fitted to matches.
+_ROUNDS = 15
+_FITS = 5
+
+# Midpoint steps of the flow that is fitted.
+_FLOW_STEPS = 6
+
+# Costs are divided by their standard deviation, which counts as no smaller than this (features lie in [0, 1]).
+_SMALLEST_SCALE = 1e-2
+
+# Control points of smaller weight follow their neighbours.
+_SMALLEST_WEIGHT = 0.01
+
+# Entries of a temporary, and entries of the cost volume at most (2 GiB in float32).
+_CHUNK = 2**22
+_LARGEST_VOLUME = 2**29
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiscreteSettings:
+    """How far and how finely to search, and how smooth the result is.
+
+    Args:
+        levels: pyramid levels to search on, coarse to fine, 0 being the images' own: displacements on level l are
+            multiples of 2^l voxels.
+        reach: longest displacement along an axis tried on each of them, in voxels of the images. A later level
+            corrects the ones before.
+        spacing: distance of the control points in displacements of one step, at least 1.
+        smoothing: standard deviation of the Gaussian that the field is smoothed with, in control points.
+        coupling: prices of a squared step between a control point and the smooth field, in standard deviations of the
+            matching cost; they rise from the first round to the last, and with them the agreement of neighbours.
+        symmetric: match moving to fixed as well, and keep what both directions agree on; takes twice as long.
+        length: range of the metric in which the flow is fitted to the matches, in control points.
+        min_determinant: smallest one-sided determinant of the result.
+
+    Raises:
+        InputError: a value out of range, named.
+    """
+
+    levels: tuple[int, ...] = (2, 1)
+    reach: tuple[float, ...] = (20.0, 6.0)
+    spacing: float = 2.0
+    smoothing: float = 1.5
+    coupling: tuple[float, ...] = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
+    symmetric: bool = True
+    length: float = 2.0
+    min_determinant: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not self.levels or len(self.levels) != len(self.reach):
+            raise InputError(f"levels and reach must have one entry each per level, got {self.levels}, {self.reach}")
+        if min(self.levels) < 0 or list(self.levels) != sorted(self.levels, reverse=True):
+            raise InputError(f"levels must not be negative and must run from coarse to fine, got {self.levels}")
+        if not self.coupling:
+            raise InputError("coupling must have at least one price")
+        positive = {"reach": self.reach, "coupling": self.coupling}
+        positive |= {name: (getattr(self, name),) for name in ("smoothing", "length", "min_determinant")}
+        for name, values in positive.items():
+            if not all(0 < value < math.inf for value in values):
+                raise InputError(f"{name} must be positive and finite, got {getattr(self, name)}")
+        if not 1 <= self.spacing < math.inf:
+            raise InputError(f"spacing must be at least 1, got {self.spacing}")
+        if self.min_determinant >= 1:
+            raise InputError(f"min_determinant must be below 1, got {self.min_determinant}")
+
+
+@torch.no_grad()
+def discrete_start(
+    fixed: Tensor, moving: Tensor, grid: Grid, *, mask: Tensor | None = None, settings: DiscreteSettings | None = None
+) -> Tensor:
+    """Return a smooth u without folds that nearly minimises Σ_x mask |MIND(fixed)(x) − MIND(moving)(x + u(x))|².
+
+    Args:
+        fixed: image that stays ``(B, C, *S)``.
+        moving: image that is warped, the same shape, already aligned to the fixed grid.
+        grid: the grid of both.
+        mask: weight of each voxel of the fixed image ``(B or 1, 1, *S)``, 0 to 1; all ones when None.
+        settings: `DiscreteSettings` with its defaults when None.
+
+    Returns:
+        u ``(B, D, *S)`` in units of spacing, its one-sided determinants at least ``min_determinant`` wherever smoothing
+        achieves that, positive in any case: the ``start`` of `register`.
+
+    Raises:
+        InputError: shapes, values that are not finite, fewer than 8 nodes on an axis, or a search so wide that its
+            costs exceed 2^29 numbers.
+
+    Notes:
+        On each level C(x, d), the squared difference of the features averaged around control point x, is computed for
+        all displacements d within reach. Then d(x) = argmin_d C(x, d) + α |d − s(x)|² and s = smooth(d) in turn, α
+        rising (Steinbrücker, Pock & Cremers, "Large displacement optical flow computation without warping", ICCV 2009;
+        with MIND features Siebert, Hansen & Heinrich, "Fast 3D registration with accurate optimisation and little
+        learning for Learn2Reg 2021"). Matches s become φ = flow(v), with v ← v + (div-curl metric)⁻¹(s − u). Memory:
+        the costs, control points × displacements, and 2 K channels of features; items are done one by one. Not
+        differentiable. The intensities do not matter, the contrast may differ. Motion within reach that the coarsest
+        level of `register` would find by itself gains nothing.
+    """
+    _check(fixed, moving, mask, grid)
+    settings = settings or DiscreteSettings()
+    masks = [None] * len(fixed) if mask is None else mask.to(fixed).expand(len(fixed), *mask.shape[1:]).split(1)
+    items = zip(fixed.split(1), moving.split(1), masks, strict=True)
+    return torch.cat([_start(*item, grid, settings) for item in items])
+
+
+def _check(fixed: Tensor, moving: Tensor, mask: Tensor | None, grid: Grid) -> None:
+    grid.check(fixed, "discrete_start: fixed")
+    grid.check(moving, "discrete_start: moving", components=fixed.shape[1])
+    if (fixed.shape[0], fixed.dtype, fixed.device) != (moving.shape[0], moving.dtype, moving.device):
+        raise InputError("discrete_start: fixed and moving must agree in batch size, dtype and device")
+    if min(grid.shape) < MIN_NODES:
+        raise InputError(f"discrete_start: every axis must have at least {MIN_NODES} voxels, got {grid.shape}")
+    for name, image in (("fixed", fixed), ("moving", moving)):
+        if not bool(image.isfinite().all()):
+            raise InputError(f"discrete_start: {name} has values that are NaN or infinite; replace them first")
+    if mask is not None and (tuple(mask.shape[1:]) != (1, *grid.shape) or len(mask) not in (1, len(fixed))):
+        raise InputError(
+            f"discrete_start: mask must have shape {(len(fixed), 1, *grid.shape)}, got {tuple(mask.shape)}"
+        )
+
+
+def _start(fixed: Tensor, moving: Tensor, mask: Tensor | None, grid: Grid, settings: DiscreteSettings) -> Tensor:
+    """Search on every level for one item."""
+    u = fixed.new_zeros(1, grid.dim, *grid.shape)
+    for level, reach in zip(settings.levels, settings.reach, strict=True):
+        search = _make_search(grid, level, reach, settings)
+        warped = warp(moving, u, grid)
+        matches = _match(search, fixed, warped, mask)
+        if settings.symmetric:
+            matches = _agreed(matches, _match(search, warped, fixed, mask), search.control)
+        u = restrict(u, grid, search.features)
+        u = _fit_flow(compose(u, prolong(matches, search.features), search.features), search)
+        u = mended(prolong(u, grid), grid, settings.min_determinant)
+    return u
+
+
+@dataclass(frozen=True)
+class _Search:
+    """What stays the same during the search on one level.
+
+    Attributes:
+        images: grid of the images.
+        source: grid on which MIND is computed, that of the finest search: averages keep what is thin.
+        features: grid on which its averages are compared; one of its spacings is one step of a displacement.
+        control: grid of the control points.
+        reach: steps along each axis.
+        settings: the settings.
+    """
+
+    images: Grid
+    source: Grid
+    features: Grid
+    control: Grid
+    reach: tuple[int, ...]
+    settings: DiscreteSettings
+
+    def labels(self, like: Tensor) -> Tensor:
+        """Return all displacements ``(L, D)`` in steps."""
+        sides = [torch.arange(-r, r + 1, dtype=like.dtype, device=like.device) for r in self.reach]
+        return torch.cartesian_prod(*sides)
+
+
+def _make_search(grid: Grid, level: int, reach: float, settings: DiscreteSettings) -> _Search:
+    source, features = (pyramid_grids(grid, index + 1)[0] for index in (settings.levels[-1], level))
+    shape = tuple(min(n, max(3, round((n - 1) / settings.spacing) + 1)) for n in features.shape)
+    control = Grid(shape, tuple(side / (n - 1) for side, n in zip(grid.extent, shape, strict=True)))
+    steps = tuple(max(1, round(reach * min(grid.spacing) / h)) for h in features.spacing)
+    entries = math.prod(2 * r + 1 for r in steps) * math.prod(shape)
+    if entries > _LARGEST_VOLUME:
+        raise InputError(
+            f"discrete_start: a reach of {reach:g} voxels on level {level} needs {entries:.1e} costs; "
+            f"lower reach, or search on a coarser level first, as levels {(level + 1, *settings.levels)}"
+        )
+    return _Search(grid, source, features, control, steps, settings)
+
+
+def _match(search: _Search, fixed: Tensor, moving: Tensor, mask: Tensor | None) -> Tensor:
+    """Return the smooth field of displacements ``(1, D, *control)`` in units of spacing that matches two images."""
+    weight = fixed.new_ones(1, 1, *search.images.shape) if mask is None else mask
+    weight = _average(weight, search.features)
+    cost = _cost_volume(_features(search, fixed), _features(search, moving), weight, search)
+    return _couple(cost, _average(weight, search.control).clamp(min=_SMALLEST_WEIGHT), search)
+
+
+def _features(search: _Search, image: Tensor) -> Tensor:
+    return _average(mind_ssc(restrict(image, search.images, search.source)), search.features)
+
+
+def _average(x: Tensor, coarse: Grid) -> Tensor:
+    """Return the mean of x around each node of a coarser grid of the same box, weighted by its hat function."""
+    for axis, count in enumerate(coarse.shape, start=2):
+        if count != x.shape[axis]:
+            hats = _hats(x.shape[axis], count, x)
+            flat = x.flatten(axis + 1) if axis + 1 < x.dim() else x.unsqueeze(-1)
+            x = (hats @ flat).view(*x.shape[:axis], count, *x.shape[axis + 1 :])
+    return x
+
+
+def _hats(nodes: int, count: int, like: Tensor) -> Tensor:
+    """Return ``(count, nodes)``: hat functions of the coarse nodes at the fine ones, each with sum 1."""
+    place = torch.linspace(0, count - 1, nodes, dtype=like.dtype, device=like.device)
+    hats = (1 - (place - torch.arange(count, device=like.device).unsqueeze(1)).abs()).clamp_(min=0)
+    return hats / hats.sum(1, keepdim=True)
+
+
+def _cost_volume(fixed: Tensor, moving: Tensor, weight: Tensor, search: _Search) -> Tensor:
+    """Return C ``(L, N)`` at the N control points, in standard deviations over the displacements."""
+    labels = search.labels(fixed).long().tolist()
+    padded = F.pad(moving, [r for r in reversed(search.reach) for _ in range(2)], mode="replicate")
+    cost, buffer = fixed.new_empty(len(labels), math.prod(search.control.shape)), torch.empty_like(fixed)
+    chunk = max(1, _CHUNK // math.prod(search.features.shape))
+    for start in range(0, len(labels), chunk):
+        part = fixed.new_empty(1, min(chunk, len(labels) - start), *search.features.shape)
+        for row, label in zip(part[0], labels[start : start + chunk], strict=True):
+            torch.sub(fixed, _shifted(padded, label, search), out=buffer)
+            torch.sum(buffer.square_()[0], 0, out=row)
+        cost[start : start + chunk] = _average(part.mul_(weight), search.control)[0].flatten(1)
+    scale = cost.std(dim=0).sum() / _average(weight, search.control).sum()
+    return cost.div_(scale.clamp(min=_SMALLEST_SCALE))
+
+
+def _shifted(padded: Tensor, label: list[int], search: _Search) -> Tensor:
+    """Return the features at x + label, from those that were padded by the reach."""
+    for axis, (step, reach, n) in enumerate(zip(label, search.reach, search.features.shape, strict=True), start=2):
+        padded = padded.narrow(axis, reach + step, n)
+    return padded
+
+
+def _couple(cost: Tensor, weight: Tensor, search: _Search) -> Tensor:
+    """Return s of the minimum over d and s of Σ C(x, d) + α |d − s|², s being smooth, for rising α."""
+    labels, settings = search.labels(cost), search.settings
+    total = _smooth(weight, settings.smoothing).clamp(min=_SMALLEST_WEIGHT)
+    s = cost.new_zeros(1, labels.shape[1], *search.control.shape)
+    for price in settings.coupling:
+        d = labels[_cheapest(cost, labels, s.flatten(2)[0], price)].T.reshape(s.shape)
+        s = _smooth(weight * d, settings.smoothing) / total
+    return s * search.features.along(search.features.spacing, s)
+
+
+def _cheapest(cost: Tensor, labels: Tensor, s: Tensor, price: float) -> Tensor:
+    """Return at each control point the number of the label d that minimises C + α (|d|² − 2 d·s), ``(N,)``."""
+    left = torch.cat([labels, labels.square().sum(1, keepdim=True)], dim=1)
+    right = torch.cat([-2 * s, torch.ones_like(s[:1])])
+    size = max(1, _CHUNK // len(labels))
+    parts = zip(cost.split(size, dim=1), right.split(size, dim=1), strict=True)
+    return torch.cat([torch.addmm(c, left, r, alpha=price).argmin(0) for c, r in parts])
+
+
+def _smooth(x: Tensor, sigma: float) -> Tensor:
+    """Convolve with a Gaussian of ``sigma`` nodes, x being mirrored at the boundary: cosines are damped."""
+    for axis in range(2, x.dim()):
+        frequency = torch.arange(x.shape[axis], dtype=x.dtype, device=x.device) * (math.pi / (x.shape[axis] - 1))
+        gain = torch.exp(-0.5 * (sigma * frequency) ** 2).view(-1, *([1] * (x.dim() - 1 - axis)))
+        x = transform(inverse_transform(x, axis, "cosine") * gain, axis, "cosine")
+    return x
+
+
+def _agreed(forward: Tensor, backward: Tensor, grid: Grid) -> Tensor:
+    """Return the forward displacement after both have been moved towards the inverse of each other."""
+    for _ in range(_ROUNDS):
+        forward, backward = (
+            0.5 * (forward - warp(backward, forward, grid)),
+            0.5 * (backward - warp(forward, backward, grid)),
+        )
+    return forward
+
+
+def _fit_flow(target: Tensor, search: _Search) -> Tensor:
+    """Return u of a flow near ``target``, both on the grid of the features."""
+    grid = search.features
+    square = (search.settings.length * search.control.cell_volume ** (1 / grid.dim)) ** 2
+    weights = Weights(div=square, curl=square, zero=1.0)
+    metric = TransformSolver(grid, weights, "slip", dtype=target.dtype, device=target.device)
+    controls = tuple(Row(1.0, (Term(1.0, k, None),)) for k in range(grid.dim))
+    v = u = torch.zeros_like(target)
+    for _ in range(_FITS):
+        v = v + metric.solve(assemble_load(controls, target - u, grid))
+        u = integrate(v, grid, steps=_FLOW_STEPS, method="midpoint")
+    return u

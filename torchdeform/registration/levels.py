@@ -1,0 +1,198 @@
+"""Climbing the levels: forces ask for divergence and curl, least squares give the velocity, its flow moves the maps."""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from time import perf_counter
+
+import torch
+from torch import Tensor
+
+from torchdeform.fem.form import Form, Row, Term
+from torchdeform.fem.operator import assemble_load
+from torchdeform.fem.spectral import TransformSolver
+from torchdeform.fem.weights import Weights
+from torchdeform.grid import Grid
+from torchdeform.registration.comparison import Comparison, compare_from_fixed, compare_from_middle
+from torchdeform.registration.landmarks import Landmarks, Pull, make_landmarks
+from torchdeform.registration.metrics.base import column
+from torchdeform.registration.pyramid import prolong, pyramid_grids
+from torchdeform.registration.result import Callback, LevelRecord, Progress
+from torchdeform.registration.scene import Scene
+from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.steps import advance, keep, lowest_determinant, mended
+from torchdeform.stencil import derivative
+from torchdeform.warp import max_voxels
+
+# Steps over which a level must have gained, see `RegistrationSettings.tolerance`.
+_PATIENCE = 10
+
+# The step falls to this share of itself over a level.
+_LAST_STEP = 0.1
+
+# Fewer nodes than this are not worth more than one thread: with two threads beside another busy program, a pair of
+# 291×216 took twice as long as with one.
+_NODES_PER_THREAD = 2**16
+
+# Weight of the divergence that opens up nearly folded places, against a force of 1 at its strongest.
+_RESISTANCE = 3.0
+
+
+@dataclass(frozen=True)
+class _Level:
+    """What stays the same during the steps of one level.
+
+    Attributes:
+        index: its number, 0 is the coarsest.
+        comparison: of the images.
+        landmarks: pairs of points that pull, or None.
+        metric: the least-squares operator.
+        held: its weight w_0 of the velocity itself.
+        controls: the form of the load: divergence and force.
+        settings: the settings.
+    """
+
+    index: int
+    comparison: Comparison
+    landmarks: Landmarks | None
+    metric: TransformSolver
+    held: float
+    controls: Form
+    settings: RegistrationSettings
+
+    @property
+    def grid(self) -> Grid:
+        """The grid of the level."""
+        return self.comparison.grid
+
+    @property
+    def sides(self) -> int:
+        """Maps of a pair."""
+        return self.comparison.sides
+
+
+def climb_levels(
+    scene: Scene, settings: RegistrationSettings, start: Tensor | None, callback: Callback | None
+) -> tuple[Tensor, tuple[LevelRecord, ...]]:
+    """Return the maps that make the images of the scene most similar, and how each level went.
+
+    Args:
+        scene: images on their scale.
+        settings: how.
+        start: maps to begin with ``(sides·B, D, *S)`` in units of spacing, on any grid of the box; zero when None.
+        callback: is shown every step.
+
+    Returns:
+        u ``(sides·B, D, *S)``: with ``symmetric`` first the maps to the fixed images, then those to the moving ones.
+    """
+    grids = pyramid_grids(scene.grid, len(settings.steps))
+    sides = 2 if settings.symmetric else 1
+    u = scene.fixed.new_zeros(sides * scene.fixed.shape[0], scene.grid.dim, *grids[0].shape)
+    u, records = u if start is None else start.to(u), []
+    for index, grid in enumerate(grids):
+        level = _make_level(index, len(grids) - 1 - index, scene.on(grid), settings)
+        with threads_worth(len(u), grid):
+            u, record = _climb(level, mended(prolong(u, grid), grid), len(grids), callback)
+        records.append(record)
+    return u, tuple(records)
+
+
+@contextmanager
+def threads_worth(items: int, grid: Grid) -> Iterator[None]:
+    """Use no more of torch's threads than the fields are worth: on a shared machine small ones wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(max(1, min(before, items * math.prod(grid.shape) // _NODES_PER_THREAD)))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _make_level(index: int, below: int, scene: Scene, settings: RegistrationSettings) -> _Level:
+    """Return the level of a scene that is on the level's grid, with so many finer levels below it."""
+    grid, sides = scene.grid, 2 if settings.symmetric else 1
+    compare = compare_from_middle if settings.symmetric else compare_from_fixed
+    pulls = settings.points_weight > 0
+    held = settings.weight_div / (settings.length_at(below) * grid.cell_volume ** (1 / grid.dim)) ** 2
+    weights = Weights(div=settings.weight_div, curl=settings.weight_curl, zero=held)
+    divergence = Row(_RESISTANCE, tuple(Term(1.0, k, k) for k in range(grid.dim)))
+    force = tuple(Row(1.0, (Term(1.0, k, None),)) for k in range(grid.dim))
+    return _Level(
+        index=index,
+        comparison=compare(scene, settings),
+        landmarks=make_landmarks(scene.fixed_points, scene.moving_points, grid, sides) if pulls else None,
+        metric=TransformSolver(grid, weights, "slip", dtype=scene.fixed.dtype, device=scene.fixed.device),
+        held=held,
+        controls=(divergence, *force),
+        settings=settings,
+    )
+
+
+def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> tuple[Tensor, LevelRecord]:
+    """Climb one level; every pair ends at the best maps it met."""
+    start, shortened, settings = perf_counter(), 0, level.settings
+    steps = settings.steps[level.index - levels]
+    best, values, tops = u, [], []
+    top = u.new_full((len(u) // level.sides,), -torch.inf)
+    active, lowest = torch.ones_like(top, dtype=torch.bool), lowest_determinant(u, level.grid)
+    for step in range(steps + 1):
+        warped, value, gradient = level.comparison.look(u)
+        pull = level.landmarks.look(u) if level.landmarks else None
+        goal = value if pull is None else value - settings.points_weight * pull.distance
+        better = goal > top
+        best, top = keep(better.repeat(level.sides), u, best), keep(better, goal, top)
+        values.append(value)
+        tops.append(top)
+        if callback:
+            callback(Progress(level.index, levels, step, steps, value, level.grid.shape))
+        active &= ~_stalled(tops, settings.tolerance)
+        if step == steps or not bool(active.any()):
+            break
+        divergence = (settings.soft_determinant / lowest - 1).clamp_(min=0)
+        v = _velocity(level, warped, gradient, divergence, pull)
+        pace = settings.step_length * (1 - (1 - _LAST_STEP) * step / steps) / level.sides
+        move = v * column((_pace(pace, v, pull, level) * active).repeat(level.sides), v)
+        u, lowest, moved, short = advance((u, lowest), move, level.grid, settings.min_determinant, level.sides)
+        active &= moved
+        shortened += short
+    return best, LevelRecord(level.grid.shape, tuple(values), shortened, perf_counter() - start)
+
+
+def _stalled(tops: list[Tensor], tolerance: float) -> Tensor:
+    """True for the pairs whose last steps raised the best similarity by too small a share of the whole rise."""
+    if len(tops) <= _PATIENCE:
+        return torch.zeros_like(tops[0], dtype=torch.bool)
+    return tops[-1] - tops[-1 - _PATIENCE] <= tolerance * (tops[-1] - tops[0])
+
+
+def _velocity(level: _Level, warped: Tensor, gradient: Tensor, divergence: Tensor, pull: Pull | None) -> Tensor:
+    """Return the velocity that least squares find for the forces and the divergence, its longest move being one voxel.
+
+    The force is scaled to 1 at its strongest, so the divergence needs no unit of similarity. That of the landmarks is
+    smoothed by one power more, w_0 (M⁻¹K)⁻¹, which keeps its sum: what least squares alone answer to a point, a
+    logarithm in 2D and 1/r in 3D, has a peak there. Two maps of a pair move against each other.
+    """
+    grid = level.grid
+    force = torch.cat([(gradient * derivative(warped, grid, a)).sum(1, keepdim=True) for a in range(grid.dim)], dim=1)
+    points = None if pull is None else pull.load(grid) * (level.settings.points_weight * warped[0].numel())
+    strongest = _strongest(force) if points is None else _strongest(force).maximum(_strongest(points))
+    scale = 1 / strongest.clamp(min=torch.finfo(force.dtype).tiny)
+    load = assemble_load(level.controls, torch.cat([divergence, force * column(scale, force)], dim=1), grid)
+    v = level.metric.solve(load, power=level.settings.power)
+    if points is not None:
+        load = points * column(scale * (grid.cell_volume * level.held), points)
+        v = v + level.metric.solve(load, power=level.settings.power + 1)
+    if level.sides == 2:
+        v = v - v.roll(len(v) // 2, 0)
+    return v / column(max_voxels(v, grid).clamp(min=torch.finfo(v.dtype).tiny), v)
+
+
+def _strongest(force: Tensor) -> Tensor:
+    return force.square().sum(1).flatten(1).amax(1).sqrt()
+
+
+def _pace(pace: float, v: Tensor, pull: Pull | None, level: _Level) -> Tensor:
+    """Return how far to go in voxels ``(B,)``: no farther than where the landmarks are nearest to each other."""
+    full = v.new_full((len(v) // level.sides,), pace)
+    return full if pull is None else pull.reach(v, level.grid).clamp(min=_LAST_STEP * pace, max=pace)

@@ -1,0 +1,113 @@
+"""Steps that keep a map open: every one is looked at by the full certificate, and shortened where it is too bold."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchdeform.diagnostics import one_sided_determinant
+from torchdeform.flow import integrate
+from torchdeform.grid import Grid
+from torchdeform.registration.metrics.base import column
+from torchdeform.stencil import jacobian_determinant
+from torchdeform.warp import compose
+
+# Rounds of smoothing that a few folded nodes are given to open.
+_SMOOTHINGS = 100
+
+_MEAN = {2: F.avg_pool2d, 3: F.avg_pool3d}
+_WIDEN = {2: F.max_pool2d, 3: F.max_pool3d}
+
+# A step that is still too bold at this fraction of itself is not taken.
+_SHORTEST = 2.0**-6
+
+
+def advance(
+    state: tuple[Tensor, Tensor], move: Tensor, grid: Grid, limit: float, sides: int = 1
+) -> tuple[Tensor, Tensor, Tensor, int]:
+    """Return u ∘ flow(move), its `lowest_determinant`, which pairs moved, and how often a step was halved.
+
+    No determinant falls below ``limit``, or below the smallest one there was if that was less. Along the halvings the
+    trial tends to u, so a bold step ends as a short one.
+
+    Args:
+        state: u ``(sides·B, D, *S)`` in units of spacing, and its `lowest_determinant`.
+        move: velocity, the same shape.
+        grid: the grid of both.
+        limit: smallest one-sided determinant that may be left.
+        sides: maps of one pair, B items apart; they are shortened together.
+    """
+    u, lowest = state
+    floor = lowest.flatten(1).amin(1).clamp(max=limit)
+    fraction, halved = torch.ones_like(floor), 0
+    while True:
+        trial = compose(u, integrate(move * column(fraction, u), grid, steps=1, method="midpoint"), grid)
+        trial_lowest = lowest_determinant(trial, grid)
+        low = _any_side(~(trial_lowest.flatten(1).amin(1) >= floor), sides)
+        count = int(low.sum()) // sides
+        if count == 0:
+            return trial, trial_lowest, ~low[: low.numel() // sides], halved
+        if bool((fraction[low] <= _SHORTEST).all()):
+            u, lowest = keep(~low, trial, u), keep(~low, trial_lowest, lowest)
+            return u, lowest, ~low[: low.numel() // sides], halved
+        halved += count
+        fraction = torch.where(low, fraction / 2, fraction)
+
+
+def _any_side(per_map: Tensor, sides: int) -> Tensor:
+    return per_map if sides == 1 else per_map.view(sides, -1).any(0).repeat(sides)
+
+
+def lowest_determinant(u: Tensor, grid: Grid) -> Tensor:
+    """Return at each node the smallest determinant ``(B, 1, *S)``, one-sided or by `jacobian_determinant`.
+
+    Inside Ω the latter is a mean of one-sided ones. On the faces, where it extrapolates, it has to be looked at.
+    """
+    lowest = one_sided_determinant(u, grid)
+    for axis, n in zip(grid.axes, grid.shape, strict=True):
+        layers = torch.cat([u.narrow(axis, 0, 3), u.narrow(axis, n - 3, 3)])
+        first, last = jacobian_determinant(layers, Grid(tuple(layers.shape[2:]), grid.spacing)).chunk(2)
+        for node, det in ((0, first), (n - 1, last)):
+            face = lowest.select(axis, node)
+            torch.minimum(face, det.select(axis, 0 if node == 0 else 2), out=face)
+    return lowest
+
+
+def mended(u: Tensor, grid: Grid, limit: float = 0.0) -> Tensor:
+    """Return u, smoothed around the nodes whose `lowest_determinant` is not above ``limit``, until there are none.
+
+    Sampling an open map on another grid, or composing two, may fold it at a few nodes. All others stay as they are, and
+    so do the faces of the box. Nodes that no smoothing opens draw their whole item towards 0.
+
+    Args:
+        u: displacement ``(B, D, *S)`` in units of spacing.
+        grid: its grid.
+        limit: at least 0.
+    """
+    for _ in range(_SMOOTHINGS):
+        low = ~(lowest_determinant(u, grid) > limit)
+        if not bool(low.any()):
+            return u
+        near = _window_mean(_WIDEN[grid.dim](low.to(u.dtype), 3, stride=1, padding=1))
+        u = _keep_faces(torch.lerp(u, _window_mean(u), near), u, grid)
+    while bool((low := ~(lowest_determinant(u, grid).flatten(1).amin(1) > 0)).any()):
+        u = torch.where(column(low, u), 0.9 * u, u)
+    return u
+
+
+def _window_mean(field: Tensor) -> Tensor:
+    """Return the mean over every node and its neighbours, the field being continued by its boundary values."""
+    dim = field.dim() - 2
+    return _MEAN[dim](F.pad(field, (1, 1) * dim, mode="replicate"), 3, stride=1)
+
+
+def _keep_faces(u: Tensor, before: Tensor, grid: Grid) -> Tensor:
+    """Give the components that lead out of the box at its faces the values they had."""
+    for k, axis in enumerate(grid.axes):
+        for end in (0, -1):
+            u[:, k].select(axis - 1, end).copy_(before[:, k].select(axis - 1, end))
+    return u
+
+
+def keep(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """Return the new items that are chosen, and the old ones in place of the others."""
+    return new if bool(chosen.all()) else torch.where(column(chosen, new), new, old)
