@@ -127,8 +127,10 @@ def _parts(image: Tensor, normalised: Tensor) -> int:
     """Return into how many equal parts to deal out the points of one image as a batch.
 
     On the CPU grid_sample uses one thread per batch item. Where the image wants a gradient the points stay together,
-    because the sum over the parts would depend on the number of threads.
+    because the sum over the parts would depend on the number of threads. torch.compile cannot ask for that number.
     """
+    if torch.compiler.is_compiling():
+        return 1
     threads, points = torch.get_num_threads(), normalised[0, 0].numel()
     alone = image.shape[0] == normalised.shape[0] == 1 and image.device.type == "cpu" and not image.requires_grad
     if not alone or points < threads * _POINTS_PER_THREAD:
