@@ -1,8 +1,9 @@
 """What every test shares: threads that do not fight, and synthetic images with known answers."""
 
+import locale
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,14 @@ _TILTED = {
         (0.289629477625, 0.956425085849, -0.036957013525),
         (-0.198669330795, 0.097843395007, 0.975170327202)),
 }  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _kept_locale() -> Iterator[None]:
+    """Writing DICOM with ITK, as tests do, leaves the process's locale at "C", where text files are read as ASCII."""
+    before = locale.setlocale(locale.LC_ALL)
+    yield
+    locale.setlocale(locale.LC_ALL, before)
 
 
 @pytest.fixture

@@ -195,7 +195,8 @@ def _fitted(
 ) -> tuple[Image, tuple[str, ...]]:
     """Return the fixed image on the finest grid that memory allows, and a sentence if that is a coarser one."""
     how = {"channels": fixed.data.shape[1], "similarity": settings.similarity}
-    need, free = estimate(fixed.grid, **how), available(device)
+    maps = 2 if settings.symmetric else 1
+    need, free = maps * estimate(fixed.grid, **how), available(device)
     if memory is None:
         if free is not None and need > free:
             raise InputError(
@@ -203,7 +204,7 @@ def _fitted(
                 f"use --memory {readable(free, spaced=False)} to register it on a coarser grid"
             )
         return fixed, ()
-    grid = fitting_grid(fixed.grid, memory, **how)
+    grid = fitting_grid(fixed.grid, memory // maps, **how)
     if grid == fixed.grid:
         return fixed, ()
     from torchdeform.registration.pyramid import restrict
