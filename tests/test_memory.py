@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 import torchdeform.memory as memory
@@ -61,6 +61,7 @@ def test_what_is_no_size_is_refused(text):
 
 
 @given(st.integers(1, 10**14))
+@example(999_500_000_000)
 def test_readable_sizes_can_be_read(size):
     assert parse_size(readable(size)) == pytest.approx(size, rel=6e-3)
     assert " " not in readable(size, spaced=False)

@@ -118,7 +118,7 @@ def parse_size(text: str) -> int:
 
 def readable(size: int, *, spaced: bool = True) -> str:
     """Return a number of bytes with a unit, as ``1.9 GB``; without the space `parse_size` takes it as a setting."""
-    exponent = min(4, max(0, (len(str(max(size, 1))) - 1) // 3))
+    exponent = next((e for e in range(4) if size / 1000**e < 999.5), 4)  # 999.5 has three digits no more
     return f"{size / 1000**exponent:.3g}{' ' if spaced else ''}{('B', 'kB', 'MB', 'GB', 'TB')[exponent]}"
 
 

@@ -14,11 +14,11 @@ from torchdeform.io.files import stem
 from torchdeform.memory import parse_size
 from torchdeform.pair import Outcome, PairFiles, register_files
 from torchdeform.registration.result import Progress as Step
-from torchdeform.registration.settings import ALIGNMENTS
+from torchdeform.registration.settings import ALIGNMENTS, similarity_weights
 
 Fixed = Annotated[
     Path,
-    typer.Argument(metavar="FIXED", help="Image that stays (PNG, JPEG, TIFF, BMP, NIfTI, MetaImage, NRRD; 2D or 3D)."),
+    typer.Argument(metavar="FIXED", help="Image that stays: PNG, TIFF, NIfTI, MetaImage, NRRD, a DICOM folder ..."),
 ]
 Moving = Annotated[Path, typer.Argument(metavar="MOVING", help="Image that is warped onto it.")]
 FixedMask = Annotated[
@@ -115,7 +115,7 @@ def summary(outcome: Outcome) -> str:
     """Return what a person wants to know of a registration, in a few lines."""
     r = outcome.record
     lines = {
-        f"similarity ({_name(r['similarity'])})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
+        f"similarity ({' + '.join(similarity_weights(outcome.result.settings.similarity))})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
         "folds": f"{r['folds']}, determinant {r['determinant_min']:.3g} to {r['determinant_max']:.3g}",
         "inverse error": f"{r['inverse_error_mean']:.2g} voxel on average, {r['inverse_error_max']:.2g} at most",
         **_measured(r),
@@ -123,14 +123,6 @@ def summary(outcome: Outcome) -> str:
         "results": f"{outcome.folder}{os.sep} ({', '.join(outcome.files)})",
     }
     return table(lines)
-
-
-def _name(similarity: object) -> str:
-    return (
-        " + ".join(f"{w:g} {name}" for name, w in similarity.items())
-        if isinstance(similarity, dict)
-        else str(similarity)
-    )
 
 
 def _measured(record: dict[str, Any]) -> dict[str, str]:

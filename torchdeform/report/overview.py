@@ -14,6 +14,7 @@ from torch import Tensor
 from torchdeform.grid import Grid
 from torchdeform.image import Image, luminance, resample
 from torchdeform.registration.result import RegistrationResult
+from torchdeform.registration.settings import similarity_weights
 from torchdeform.stencil import jacobian_determinant
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def write_overview(path: Path, fixed: Image, moving: Image, result: Registration
     Args:
         path: the file to write.
         fixed: fixed image.
-        moving: moving image, in its own place.
+        moving: moving image, in its own place, or where the alignment has taken it.
         result: a result of one pair (batch of 1) on the fixed grid.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -102,22 +103,31 @@ def write_overview(path: Path, fixed: Image, moving: Image, result: Registration
     for plane, (title, draw) in product(planes, _PANELS.items()):
         axes = next(cells)
         draw(axes, scene, plane)
-        axes.set_title(title if plane is planes[0] else "", fontsize=10, color=_INK)
+        axes.set_title(_title(title, result) if plane is planes[0] else "", fontsize=10, color=_INK)
     for axes in cells:
         _draw_similarity(axes, result, planes[0])
     figure.suptitle(_headline(result), fontsize=11, color=_INK)
     FigureCanvasAgg(figure).print_png(str(path))
 
 
+def _title(panel: str, result: RegistrationResult) -> str:
+    """Return the title of a panel; the moving image is shown where the alignment has taken it."""
+    return f"{panel}, aligned" if panel == "moving" and result.affine is not None else panel
+
+
 def _headline(result: RegistrationResult) -> str:
     diagnosis = result.diagnosis
     before, after = result.similarity_before.item(), result.similarity_after.item()
     return (
-        f"{result.settings.similarity} {before:.3g} → {after:.3g}     "
+        f"{_measure(result)} {before:.3g} → {after:.3g}     "
         f"folds {int(diagnosis.folds.item())}     "
         f"determinant {diagnosis.det_min.item():.2g} to {diagnosis.det_max.item():.2g}     "
         f"inverse error {result.inverse_error_mean.item():.2g} voxel"
     )
+
+
+def _measure(result: RegistrationResult) -> str:
+    return " + ".join(similarity_weights(result.settings.similarity))
 
 
 def _scene(fixed: Image, moving: Image, result: RegistrationResult) -> Scene:
@@ -263,7 +273,7 @@ def _draw_similarity(axes: "Axes", result: RegistrationResult, plane: Plane) -> 
         values = [value.item() for value in level.similarity]
         axes.plot(range(start, start + len(values)), values, label="×".join(map(str, level.shape)), linewidth=1.6)
         start += max(len(values) - 1, 0)
-    axes.set_title(f"{result.settings.similarity} over the steps", fontsize=10, color=_INK)
+    axes.set_title(f"{_measure(result)} over the steps", fontsize=10, color=_INK)
     axes.tick_params(labelsize=8, colors=_INK)
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_box_aspect(plane.height_over_width)
