@@ -113,9 +113,9 @@ def register(
 
 def summary(outcome: Outcome) -> str:
     """Return what a person wants to know of a registration, in a few lines."""
-    r = outcome.record
+    r, measure = outcome.record, " + ".join(similarity_weights(outcome.result.settings.similarity))
     lines = {
-        f"similarity ({' + '.join(similarity_weights(outcome.result.settings.similarity))})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
+        f"similarity ({measure})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
         "folds": f"{r['folds']}, determinant {r['determinant_min']:.3g} to {r['determinant_max']:.3g}",
         "inverse error": f"{r['inverse_error_mean']:.2g} voxel on average, {r['inverse_error_max']:.2g} at most",
         **_measured(r),
