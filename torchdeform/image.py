@@ -13,6 +13,7 @@ from torchdeform.warp import sample
 
 # Alpha that means opaque, by pixel type; floating types count from 0 to 1.
 _OPAQUE = {"uint8": 255.0, "uint16": 65535.0}
+_RGBA = 4
 
 
 @dataclass(frozen=True)
@@ -116,15 +117,20 @@ def luminance(image: Image) -> Image:
     channels = image.data.shape[1]
     if channels == 1:
         return image
-    if channels not in (3, 4):
+    if channels not in (3, _RGBA):
         raise InputError(f"{image.name} has {channels} channels; give a grey (1), RGB (3) or RGBA (4) image")
     from kornia.color import rgb_to_grayscale
 
-    colours = image.data[:, :3]
-    if channels == 4:
-        colours = colours * (image.data[:, 3:] / _OPAQUE.get(image.pixel_type, 1.0))
-    grey = rgb_to_grayscale(colours.flatten(2).unsqueeze(-1))  # one column of pixels, whatever the dimension
+    grey = rgb_to_grayscale(opaque(image).data.flatten(2).unsqueeze(-1))  # one column of pixels, whatever the dimension
     return replace(image, data=grey.view(1, 1, *image.grid.shape))
+
+
+def opaque(image: Image) -> Image:
+    """Return an RGBA image as RGB, what is transparent counting as black; images without alpha as they are."""
+    if image.data.shape[1] != _RGBA:
+        return image
+    colours, alpha = image.data[:, :3], image.data[:, 3:]
+    return replace(image, data=colours * (alpha / _OPAQUE.get(image.pixel_type, 1.0)))
 
 
 def require_registrable(image: Image) -> None:

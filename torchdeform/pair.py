@@ -18,6 +18,8 @@ from torchdeform.io.points import matched, read_points
 from torchdeform.memory import available, estimate, fitting_grid, readable
 from torchdeform.registration.guidance import Guidance
 from torchdeform.registration.intensities import corresponding_channels
+from torchdeform.registration.pyramid import restrict
+from torchdeform.registration.refine import onto_grid
 from torchdeform.registration.result import Callback, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.overview import write_overview
@@ -183,8 +185,6 @@ def register_files(
         work.to(where), inputs.moving.to(where), settings, guidance=inputs.guidance.to(where), callback=callback
     )
     if work is not inputs.fixed:
-        from torchdeform.registration.refine import onto_grid
-
         result = onto_grid(result, inputs.fixed.to(where), inputs.moving.to(where), inputs.guidance.to(where))
     _require_finite(result)
     return _publish(files, replace(inputs, warnings=(*inputs.warnings, *notes)), result, read)
@@ -207,8 +207,6 @@ def _fitted(
     grid = fitting_grid(fixed.grid, memory // maps, **how)
     if grid == fixed.grid:
         return fixed, ()
-    from torchdeform.registration.pyramid import restrict
-
     sizes = " instead of ".join("×".join(map(str, g.shape[::-1])) for g in (grid, fixed.grid))
     note = f"to stay below {readable(memory)} of memory the finest level has {sizes} nodes"
     return replace(fixed, data=restrict(fixed.data, fixed.grid, grid), grid=grid), (note,)
@@ -253,14 +251,8 @@ def _write_images(folder: Path, files: PairFiles, inputs: Inputs, result: Regist
     if files.moving_labels is not None and isinstance(inputs.guidance.moving_labels, Image):
         carried = transform.labels(inputs.guidance.moving_labels, fixed)
         write_labels(carried, folder / f"warped_labels{ending_like(files.moving_labels, carried)}")
-    before = moving if result.affine is None else _through_affine(moving, fixed, result)
+    before = moving if result.affine is None else Transform((result.affine,)).image(moving, fixed)
     write_overview(folder / "overview.png", fixed, before, result)
-
-
-def _through_affine(moving: Image, fixed: Image, result: RegistrationResult) -> Image:
-    """Return the moving image as it lies on the fixed grid after alignment, which the picture starts from."""
-    aligned = Transform((result.affine,), fixed, moving) if result.affine is not None else None
-    return moving if aligned is None else aligned.image(moving, fixed)
 
 
 def _former_files(out: Path) -> set[str]:

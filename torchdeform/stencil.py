@@ -57,6 +57,28 @@ def derivative(field: Tensor, grid: Grid, axis: int, *, order: int = 2) -> Tenso
     return torch.cat(parts, dim=dim)
 
 
+def add_adjoint_derivative(total: Tensor, field: Tensor, grid: Grid, axis: int, *, order: int = 2) -> None:
+    """Add D_aᵀ field to ``total``, in place, D_a being `derivative`: Σ y D_a x = Σ x D_aᵀ y for all x and y.
+
+    Args:
+        total: ``(B, C, *S)``.
+        field: the same shape.
+        grid: the grid of both.
+        axis: spatial axis of the derivative, from 0.
+        order: 2 or 4.
+    """
+    (interior, first), dim, n = KERNELS[order], axis + 2, grid.shape[axis]
+    step, count = grid.spacing[axis], grid.shape[axis] - len(KERNELS[order][0]) + 1
+    inner = field.narrow(dim, len(first), count)
+    for k, weight in enumerate(interior):
+        if weight:
+            total.narrow(dim, k, count).add_(inner, alpha=weight / step)
+    for row, kernel in enumerate(first):
+        for k, weight in enumerate(kernel):
+            total.select(dim, k).add_(field.select(dim, row), alpha=weight / step)
+            total.select(dim, n - 1 - k).sub_(field.select(dim, n - 1 - row), alpha=weight / step)
+
+
 def _convolve(field: Tensor, dim: int, kernel: tuple[float, ...], step: float) -> Tensor:
     """Return Σ_k kernel_k field(x + k h) / h where the kernel fits, by shifted sums: conv3d takes ten times as long."""
     count = field.shape[dim] - len(kernel) + 1

@@ -13,9 +13,10 @@ from torchdeform.image import Image
 from torchdeform.registration.affine import AlignmentSettings, affine_warp, align
 from torchdeform.registration.affine_climb import climb
 from torchdeform.registration.affine_detail import DetailCorrelation
-from torchdeform.registration.affine_group import KINDS, angle, exponential, generators, homogeneous, rotations
+from torchdeform.registration.affine_group import angle, exponential, generators, homogeneous, rotations
 from torchdeform.registration.affine_level import Frame, Level, Masked
 from torchdeform.registration.affine_starts import body, make_starts
+from torchdeform.registration.settings import ALIGNMENTS
 from torchdeform.registration.similarity import make_similarity
 from torchdeform.transform import Affine
 
@@ -187,7 +188,7 @@ def test_the_same_again_is_the_same_to_the_last_bit():
     assert torch.equal(first.affine.offset, second.affine.offset)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ALIGNMENTS)
 @pytest.mark.parametrize("dim", [2, 3])
 def test_each_kind_stays_what_it_is(dim, kind):
     fixed, moving = make_pair(make_true(SHEARED[dim] @ turn(dim, 20)))

@@ -55,7 +55,7 @@ def test_overview_is_the_same_every_time(tmp_path, make_image, make_result):
 
 def test_planes_show_the_patient_upright(make_image):
     """However a volume is stored, z goes up, y down and x to the right on the sheet."""
-    from torchdeform.report.overview import _planes
+    from torchdeform.report.overview import middle_planes
 
     grid_image = make_image((5, 6, 7))
     for direction, vertical in (
@@ -64,7 +64,7 @@ def test_planes_show_the_patient_upright(make_image):
         (((0, 0, 1), (1, 0, 0), (0, 1, 0)), [(2, False), (1, True), (1, True)]),
     ):
         image = Image(grid_image.data, grid_image.grid, direction=direction)
-        assert [(plane.axes[0], plane.turned[0]) for plane in _planes(image)] == vertical
+        assert [(plane.axes[0], plane.turned[0]) for plane in middle_planes(image)] == vertical
 
 
 def test_record_is_plain_json(tmp_path, make_image, make_result):

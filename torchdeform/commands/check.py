@@ -6,27 +6,22 @@ from typing import Annotated
 import typer
 
 from torchdeform.check import ERROR, is_oblique, orientation, preflight
+from torchdeform.commands.options import FixedMask, MovingMask
 from torchdeform.errors import InputError, require_choice
 from torchdeform.image import Image
 from torchdeform.io import read_image
 from torchdeform.io.files import staged, suffix
-from torchdeform.registration.affine_group import KINDS
+from torchdeform.registration.settings import ALIGNMENTS
 from torchdeform.report.overlay import write_overlay
 
 Fixed = Annotated[
     Path, typer.Argument(metavar="FIXED", help="Image that shall stay: a file, or a folder with a DICOM series.")
 ]
 Moving = Annotated[Path, typer.Argument(metavar="MOVING", help="Image that shall be warped onto it.")]
-FixedMask = Annotated[
-    Path | None, typer.Option(metavar="FILE", show_default="none", help="Where FIXED counts (not 0).")
-]
-MovingMask = Annotated[
-    Path | None, typer.Option(metavar="FILE", show_default="none", help="Where MOVING counts (not 0).")
-]
 Picture = Annotated[
     Path | None, typer.Option("--out", metavar="PICTURE.png", show_default="none", help="Write an overlay picture.")
 ]
-Align = Annotated[str, typer.Option(metavar="KIND", help=f"Alignment that shall come first: {', '.join(KINDS)}.")]
+Align = Annotated[str, typer.Option(metavar="KIND", help=f"Alignment that shall come first: {', '.join(ALIGNMENTS)}.")]
 
 
 def check(
@@ -42,7 +37,7 @@ def check(
     Orientations name where x, y and z point to: LPS is left, posterior, superior. Exit code 2 if there is an error.
     Example: torchdeform check fixed.nii.gz moving.nii.gz --out overlay.png
     """
-    require_choice(align, KINDS, "--align")
+    require_choice(align, ALIGNMENTS, "--align")
     if out is not None and suffix(out) != ".png":
         raise InputError(f"--out {out}: the picture is a PNG; let its name end in .png")
     images = read_image(fixed), read_image(moving)

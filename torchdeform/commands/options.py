@@ -20,6 +20,12 @@ Out = Annotated[
         metavar="DIR", show_default="named after the image", help="Folder for the results; its other files are kept."
     ),
 ]
+FixedMask = Annotated[
+    Path | None, typer.Option(metavar="FILE", show_default="none", help="Where FIXED counts (not 0).")
+]
+MovingMask = Annotated[
+    Path | None, typer.Option(metavar="FILE", show_default="none", help="Where MOVING counts (not 0).")
+]
 Device = Annotated[str, typer.Option(metavar="NAME", help="auto, cpu or cuda.")]
 Quiet = Annotated[bool, typer.Option("--quiet", metavar="", help="Print errors only.")]
 Version = Annotated[

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from torchdeform.commands.options import Device, Out, Quiet, Version, table
+from torchdeform.commands.options import Device, FixedMask, MovingMask, Out, Quiet, Version, table
 from torchdeform.config import load_settings, parse_override, preset_names
 from torchdeform.io.files import stem
 from torchdeform.memory import parse_size
@@ -21,12 +21,6 @@ Fixed = Annotated[
     typer.Argument(metavar="FIXED", help="Image that stays: PNG, TIFF, NIfTI, MetaImage, NRRD, a DICOM folder ..."),
 ]
 Moving = Annotated[Path, typer.Argument(metavar="MOVING", help="Image that is warped onto it.")]
-FixedMask = Annotated[
-    Path | None, typer.Option(metavar="FILE", show_default="none", help="Where FIXED counts (not 0).")
-]
-MovingMask = Annotated[
-    Path | None, typer.Option(metavar="FILE", show_default="none", help="Where MOVING counts (not 0).")
-]
 FixedPoints = Annotated[
     Path | None,
     typer.Option(metavar="FILE", show_default="none", help="Landmarks (csv, elastix txt, Slicer), measured ..."),

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchdeform.grid import Grid
 from torchdeform.solvers.transforms import Kind, separable_transform
-from torchdeform.stencil import CURL_PAIRS, KERNELS, derivative, determinant, map_jacobian
+from torchdeform.stencil import CURL_PAIRS, KERNELS, add_adjoint_derivative, derivative, determinant, map_jacobian
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Differences:
         rows = self._weighted(rows)
         total = rows.new_zeros(rows.shape[0], self.grid.dim, *self.grid.shape)
         for a in range(self.grid.dim):
-            _add_transposed_derivative(total, self._along(a, rows, factors), self.grid, a, self.order)
+            add_adjoint_derivative(total, self._along(a, rows, factors), self.grid, a, order=self.order)
         return clear_boundary(total, self.grid)
 
     def _along(self, axis: int, rows: Tensor, factors: Tensor | None) -> Tensor:
@@ -129,20 +129,6 @@ def _symbol(grid: Grid, axis: int, order: int, like: Tensor) -> Tensor:
     symbol = symbol / grid.spacing[axis]
     symbol[[0, -1]] = 1.0
     return symbol.to(like)
-
-
-def _add_transposed_derivative(total: Tensor, field: Tensor, grid: Grid, axis: int, order: int) -> None:
-    """Add the transpose of `stencil.derivative` of ``field (B, C, *S)`` to ``total``, without the weights of nodes."""
-    (interior, first), dim, n = KERNELS[order], axis + 2, grid.shape[axis]
-    step, count = grid.spacing[axis], grid.shape[axis] - len(KERNELS[order][0]) + 1
-    inner = field.narrow(dim, len(first), count)
-    for k, weight in enumerate(interior):
-        if weight:
-            total.narrow(dim, k, count).add_(inner, alpha=weight / step)
-    for row, kernel in enumerate(first):
-        for k, weight in enumerate(kernel):
-            total.select(dim, k).add_(field.select(dim, row), alpha=weight / step)
-            total.select(dim, n - 1 - k).sub_(field.select(dim, n - 1 - row), alpha=weight / step)
 
 
 def dots(a: Tensor, b: Tensor) -> Tensor:

@@ -11,22 +11,18 @@ from torchdeform.errors import InputError, require_choice
 from torchdeform.fem.form import Row, Term
 from torchdeform.fem.operator import assemble_load
 from torchdeform.fem.spectral import TransformSolver
-from torchdeform.fem.weights import Weights
 from torchdeform.flow import integrate
 from torchdeform.grid import Grid
 from torchdeform.nn.losses import SIMILARITIES
 from torchdeform.nn.operators import open_share
 from torchdeform.nn.precision import full_precision
+from torchdeform.registration.levels import image_force, metric_weights, step_length, strongest_of
 from torchdeform.registration.metrics.base import column
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.stencil import derivative
 from torchdeform.warp import compose, warp
 
 # Measures of images as they are; ``mind`` compares features, which need warping of their own.
 _MEASURES = ("ssd", "ncc", "lncc", "mi", "nmi", "ngf")
-
-# The step falls to this share of itself.
-_LAST_STEP = 0.1
 
 
 class DeformableRegistration(nn.Module):
@@ -78,14 +74,12 @@ class DeformableRegistration(nn.Module):
         self.grid.check_vector(u, "DeformableRegistration: start")
         metric = self._metric(fixed)
         for step in range(self.steps):
-            pace = self.settings.step_length * (1 - (1 - _LAST_STEP) * step / self.steps)
+            pace = step_length(self.settings, step, self.steps)
             u = checkpoint(self._step, fixed, moving, u, pace, metric, use_reentrant=False)
         return u
 
     def _metric(self, like: Tensor) -> TransformSolver:
-        voxel = self.grid.cell_volume ** (1 / self.grid.dim)
-        zero = self.settings.weight_div / (self.settings.length_at(0) * voxel) ** 2
-        weights = Weights(self.settings.weight_div, self.settings.weight_curl, zero)
+        weights = metric_weights(self.grid, self.settings, 0)
         return TransformSolver(self.grid, weights, "slip", dtype=like.dtype, device=like.device)
 
     def _step(self, fixed: Tensor, moving: Tensor, u: Tensor, pace: float, metric: TransformSolver) -> Tensor:
@@ -101,11 +95,8 @@ class DeformableRegistration(nn.Module):
     def _move(self, fixed: Tensor, moving: Tensor, u: Tensor, metric: TransformSolver) -> Tensor:
         """Return the velocity that least squares find for the force, its strongest part being 1."""
         warped = warp(moving, u, self.grid)
-        slope = self._slope(fixed, warped)
-        parts = [(slope * derivative(warped, self.grid, a)).sum(1, keepdim=True) for a in range(self.grid.dim)]
-        force = torch.cat(parts, dim=1)
-        strongest = force.square().sum(1).flatten(1).amax(1).sqrt()
-        force = force / column(strongest.clamp(min=torch.finfo(force.dtype).tiny), force)
+        force = image_force(self._slope(fixed, warped), warped, self.grid)
+        force = force / column(strongest_of(force).clamp(min=torch.finfo(force.dtype).tiny), force)
         values = tuple(Row(1.0, (Term(1.0, k, None),)) for k in range(self.grid.dim))
         return metric.solve(assemble_load(values, force, self.grid), power=self.settings.power)
 

@@ -12,10 +12,10 @@ from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.grid import Grid
 from torchdeform.image import Image, luminance, require_registrable, resample
 from torchdeform.registration.affine_detail import DetailCorrelation
-from torchdeform.registration.affine_group import KINDS, generators
+from torchdeform.registration.affine_group import generators
 from torchdeform.registration.affine_level import Frame, Level, Masked, coarse_grid
 from torchdeform.registration.affine_search import Candidate, Found, climbed, search
-from torchdeform.registration.settings import similarity_weights
+from torchdeform.registration.settings import ALIGNMENTS, similarity_weights
 from torchdeform.registration.similarity import Similarity, features, make_similarity, on_one_scale
 from torchdeform.transform import Affine
 from torchdeform.warp import sample
@@ -134,7 +134,7 @@ def align(
         Runs on the images' device, in float32; not differentiable, see `affine_warp`.
     """
     settings, began = settings or AlignmentSettings(), perf_counter()
-    require_choice(kind, KINDS, "align: kind")
+    require_choice(kind, ALIGNMENTS, "align: kind")
     pair = _prepared((fixed, fixed_mask), (moving, moving_mask), settings)
     frame = Frame.of(pair[0].image)
     levels, found = _levels(*pair, frame, settings), Found([])

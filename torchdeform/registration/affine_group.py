@@ -6,8 +6,6 @@ import math
 import torch
 from torch import Tensor
 
-KINDS = ("none", "translation", "rigid", "similarity", "affine")
-
 # What each kind adds to the shifts.
 _LINEAR = {"translation": (), "rigid": ("rotations",), "similarity": ("rotations", "scale"), "affine": ("all",)}
 

@@ -97,9 +97,9 @@ def _register_tensors(
     scene = scene.scaled(settings)
     middle = between_tensors(scene) if settings.symmetric else None
     u, records = _climb(scene, middle, settings, start, callback)
-    result = _finish(scene, u, settings, records)
     with threads_worth(len(u), grid):
-        return replace(result, warped=warp(moving, u, grid), evaluation=evaluate_tensors(guidance, u, grid))
+        warped, evaluation = warp(moving, u, grid), evaluate_tensors(guidance, u, grid)
+    return replace(_finish(scene, u, warped, settings, records), evaluation=evaluation)
 
 
 def _checked_grid(fixed: Tensor, moving: Tensor, guidance: Guidance) -> Grid:
@@ -147,10 +147,10 @@ def _register_images(
     scene = place(both[0], both[1] if affine is None else both[1].moved(affine.inverse()), fixed).scaled(settings)
     middle = _between(both, scene, affine, settings) if settings.symmetric else None
     u, records = _climb(scene, middle, settings, start, callback)
-    result = _finish(scene, u, settings, records)
+    warped = resample(seen, fixed, u).to(moving.data.dtype)
+    result = _finish(scene, u, warped, settings, records)
     return replace(
         result,
-        warped=resample(seen, fixed, u).to(moving.data.dtype),
         affine=affine,
         alignment=alignment,
         evaluation=evaluate_images(fixed, guidance, affine, u),
@@ -204,9 +204,9 @@ def _checked_start(start: Tensor, scene: Scene) -> Tensor:
 
 
 def _finish(
-    scene: Scene, u: Tensor, settings: RegistrationSettings, records: tuple[LevelRecord, ...]
+    scene: Scene, u: Tensor, warped: Tensor, settings: RegistrationSettings, records: tuple[LevelRecord, ...]
 ) -> RegistrationResult:
-    """Invert the map and judge it; the warped image is still the one that was compared."""
+    """Invert the map and judge it."""
     grid = scene.grid
     with threads_worth(len(u), grid):
         start = perf_counter()
@@ -219,7 +219,7 @@ def _finish(
         return RegistrationResult(
             displacement=u,
             inverse=inverse,
-            warped=warp(scene.moving, u, grid),
+            warped=warped,
             grid=grid,
             similarity_before=before,
             similarity_after=after,

@@ -7,17 +7,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.errors import InputError
-from torchdeform.image import Image, luminance
+from torchdeform.image import Image, luminance, opaque
 
 # Values sorted to find the scale of one channel.
 _SAMPLES = 2**20
 
 # Percentiles that become 0 and 1.
 _LOW, _HIGH = 0.005, 0.995
-
-# Alpha that means opaque, by pixel type; floating types count from 0 to 1.
-_OPAQUE = {"uint8": 255.0, "uint16": 65535.0}
-_RGBA = 4
 
 _POOL = {2: F.avg_pool2d, 3: F.avg_pool3d}
 _INTERPOLATION = {2: "bilinear", 3: "trilinear"}
@@ -32,7 +28,7 @@ def corresponding_channels(fixed: Image, moving: Image) -> tuple[Image, Image]:
     Raises:
         InputError: numbers of channels that do not correspond.
     """
-    both = [_opaque(image) for image in (fixed, moving)]
+    both = [opaque(image) for image in (fixed, moving)]
     if all(bool((image.data == image.data[:, :1]).all()) for image in both):
         both = [replace(image, data=image.data[:, :1]) for image in both]
     counts = [image.data.shape[1] for image in both]
@@ -42,13 +38,6 @@ def corresponding_channels(fixed: Image, moving: Image) -> tuple[Image, Image]:
         named = f"{fixed.name} has {counts[0]} channels and {moving.name} {counts[1]}"
         raise InputError(f"{named}, which do not correspond; give images with the same channels, or grey ones")
     return luminance(both[0]), luminance(both[1])
-
-
-def _opaque(image: Image) -> Image:
-    if image.data.shape[1] != _RGBA:
-        return image
-    colours, alpha = image.data[:, :3], image.data[:, 3:]
-    return replace(image, data=colours * (alpha / _OPAQUE.get(image.pixel_type, 1.0)))
 
 
 def fill(image: Tensor, mask: Tensor) -> Tensor:

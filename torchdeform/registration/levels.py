@@ -109,13 +109,18 @@ def threads_worth(items: int, grid: Grid) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def metric_weights(grid: Grid, settings: RegistrationSettings, below: int) -> Weights:
+    """Return the weights of the metric on a level's grid that has so many finer levels below it."""
+    held = settings.weight_div / (settings.length_at(below) * grid.cell_volume ** (1 / grid.dim)) ** 2
+    return Weights(div=settings.weight_div, curl=settings.weight_curl, zero=held)
+
+
 def _make_level(index: int, below: int, scene: Scene, settings: RegistrationSettings) -> _Level:
     """Return the level of a scene that is on the level's grid, with so many finer levels below it."""
     grid, sides = scene.grid, 2 if settings.symmetric else 1
     compare = compare_from_middle if settings.symmetric else compare_from_fixed
     pulls = settings.points_weight > 0
-    held = settings.weight_div / (settings.length_at(below) * grid.cell_volume ** (1 / grid.dim)) ** 2
-    weights = Weights(div=settings.weight_div, curl=settings.weight_curl, zero=held)
+    weights = metric_weights(grid, settings, below)
     divergence = Row(_RESISTANCE, tuple(Term(1.0, k, k) for k in range(grid.dim)))
     force = tuple(Row(1.0, (Term(1.0, k, None),)) for k in range(grid.dim))
     return _Level(
@@ -123,7 +128,7 @@ def _make_level(index: int, below: int, scene: Scene, settings: RegistrationSett
         comparison=compare(scene, settings),
         landmarks=make_landmarks(scene.fixed_points, scene.moving_points, grid, sides) if pulls else None,
         metric=TransformSolver(grid, weights, "slip", dtype=scene.fixed.dtype, device=scene.fixed.device),
-        held=held,
+        held=float(weights.zero),
         controls=(divergence, *force),
         settings=settings,
     )
@@ -151,7 +156,7 @@ def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> 
             break
         divergence = (settings.soft_determinant / lowest - 1).clamp_(min=0)
         v = _velocity(level, warped, gradient, divergence, pull)
-        pace = settings.step_length * (1 - (1 - _LAST_STEP) * step / steps) / level.sides
+        pace = step_length(settings, step, steps) / level.sides
         move = v * column((_pace(pace, v, pull, level) * active).repeat(level.sides), v)
         u, lowest, moved, short = advance((u, lowest), move, level.grid, settings.min_determinant, level.sides)
         active &= moved
@@ -174,9 +179,9 @@ def _velocity(level: _Level, warped: Tensor, gradient: Tensor, divergence: Tenso
     logarithm in 2D and 1/r in 3D, has a peak there. Two maps of a pair move against each other.
     """
     grid = level.grid
-    force = torch.cat([(gradient * derivative(warped, grid, a)).sum(1, keepdim=True) for a in range(grid.dim)], dim=1)
+    force = image_force(gradient, warped, grid)
     points = None if pull is None else pull.load(grid) * (level.settings.points_weight * warped[0].numel())
-    strongest = _strongest(force) if points is None else _strongest(force).maximum(_strongest(points))
+    strongest = strongest_of(force) if points is None else strongest_of(force).maximum(strongest_of(points))
     scale = 1 / strongest.clamp(min=torch.finfo(force.dtype).tiny)
     load = assemble_load(level.controls, torch.cat([divergence, force * column(scale, force)], dim=1), grid)
     v = level.metric.solve(load, power=level.settings.power)
@@ -188,7 +193,18 @@ def _velocity(level: _Level, warped: Tensor, gradient: Tensor, divergence: Tenso
     return v / column(max_voxels(v, grid).clamp(min=torch.finfo(v.dtype).tiny), v)
 
 
-def _strongest(force: Tensor) -> Tensor:
+def step_length(settings: RegistrationSettings, step: int, steps: int) -> float:
+    """Return the longest move in voxels in this step of so many, from 0."""
+    return settings.step_length * (1 - (1 - _LAST_STEP) * step / steps)
+
+
+def image_force(gradient: Tensor, warped: Tensor, grid: Grid) -> Tensor:
+    """Return Σ_c gradient_c ∇warped_c ``(B, D, *S)`` from N ∂S/∂warped and the warped image, both ``(B, C, *S)``."""
+    return torch.cat([(gradient * derivative(warped, grid, a)).sum(1, keepdim=True) for a in range(grid.dim)], dim=1)
+
+
+def strongest_of(force: Tensor) -> Tensor:
+    """Return the largest |force| of each item ``(B,)``."""
     return force.square().sum(1).flatten(1).amax(1).sqrt()
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchdeform.grid import Grid
 from torchdeform.image import Image
-from torchdeform.report.overview import Plane, _frame, _planes, _to_unit
+from torchdeform.report.overview import Plane, frame, middle_planes, to_unit
 from torchdeform.warp import sample
 
 if TYPE_CHECKING:
@@ -67,13 +67,13 @@ def _draw_row(row: "Sequence[Axes]", cut: _Cut, *, titled: bool) -> None:
         for inside, colour in zip(cut.inside, _OUTLINES, strict=True):
             if inside.any() and not inside.all():
                 axes.contour(inside.astype(np.float32), levels=[0.5], colors=[colour], linewidths=0.9)
-        _frame(axes, cut.plane)
+        frame(axes, cut.plane)
         axes.set_title(title if titled else "", fontsize=10, color=_INK)
 
 
 def _cuts(fixed: Image, moving: Image) -> list[_Cut]:
     canvas = _canvas(fixed, moving)
-    return [_cut(plane, canvas, (fixed, moving)) for plane in _planes(canvas)]
+    return [_cut(plane, canvas, (fixed, moving)) for plane in middle_planes(canvas)]
 
 
 def _canvas(fixed: Image, moving: Image) -> Image:
@@ -109,7 +109,7 @@ def _cut(plane: Plane, canvas: Image, images: tuple[Image, Image]) -> _Cut:
 
 def _values(image: Image, world: Tensor, plane: Plane) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     data = image.data.detach().cpu()
-    grey = _to_unit(data[:, :3], data).mean(1, keepdim=True).float()
+    grey = to_unit(data[:, :3], data).mean(1, keepdim=True).float()
     points = image.to_grid(world)
     values = sample(grey, points, image.grid, outside=torch.nan)[0, 0].numpy()
     flat = values.reshape([values.shape[axis] for axis in sorted(plane.axes)])

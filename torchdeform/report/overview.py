@@ -94,7 +94,7 @@ def write_overview(path: Path, fixed: Image, moving: Image, result: Registration
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    scene, planes = _scene(fixed, moving, result), _planes(fixed)
+    scene, planes = _scene(fixed, moving, result), middle_planes(fixed)
     rows, columns = _SHEET[fixed.grid.dim]
     width = _PANEL_INCHES[fixed.grid.dim]
     heights = [width * min(2.0, max(0.4, plane.height_over_width)) for plane in planes] * (rows // len(planes))
@@ -136,13 +136,13 @@ def _scene(fixed: Image, moving: Image, result: RegistrationResult) -> Scene:
     placed = replace(moving, data=resample(moving, fixed).float(), grid=grid)
     warped = replace(moving, data=result.warped.detach().cpu().float(), grid=grid)
     greys = luminance(fixed).data, luminance(moving).data
-    grey = _to_unit(greys[0], greys[0])
-    before, after = ((_to_unit(luminance(image).data, greys[1]) - grey).abs() for image in (placed, warped))
+    grey = to_unit(greys[0], greys[0])
+    before, after = ((to_unit(luminance(image).data, greys[1]) - grey).abs() for image in (placed, warped))
     log_det = jacobian_determinant(u, grid).clamp(min=_SMALLEST).log()
     return Scene(
-        fixed=_to_unit(fixed.data, fixed.data),
-        moving=_to_unit(placed.data, moving.data),
-        warped=_to_unit(warped.data, moving.data),
+        fixed=to_unit(fixed.data, fixed.data),
+        moving=to_unit(placed.data, moving.data),
+        warped=to_unit(warped.data, moving.data),
         before=before,
         after=after,
         u=u,
@@ -152,7 +152,7 @@ def _scene(fixed: Image, moving: Image, result: RegistrationResult) -> Scene:
     )
 
 
-def _to_unit(values: Tensor, scale: Tensor) -> Tensor:
+def to_unit(values: Tensor, scale: Tensor) -> Tensor:
     """Return values with the dark and bright ends of ``scale`` at 0 and 1, all colours alike, alpha dropped."""
     colours = slice(0, 3) if scale.shape[1] > 1 else slice(0, 1)
     low, high = _quantiles(scale[:, colours], *_PERCENTILES)
@@ -165,7 +165,7 @@ def _quantiles(values: Tensor, *percent: float) -> list[float]:
     return [float(q) for q in np.percentile(flat[:: 1 + flat.numel() // 2**20].numpy(), percent)]
 
 
-def _planes(image: Image) -> list[Plane]:
+def middle_planes(image: Image) -> list[Plane]:
     """Return the planes to show: the image itself in 2D; axial, coronal and sagittal middle planes in 3D.
 
     Volumes are turned as radiologists look at them: superior up, anterior up or left, the patient's left on the right.
@@ -202,11 +202,11 @@ def _show(axes: "Axes", plane: Plane, field: Tensor, **how: Any) -> "AxesImage":
         aspect=plane.aspect,
         **how,
     )
-    _frame(axes, plane)
+    frame(axes, plane)
     return shown
 
 
-def _frame(axes: "Axes", plane: Plane) -> None:
+def frame(axes: "Axes", plane: Plane) -> None:
     down, across = plane.shape
     axes.set_xlim(*_turn((-0.5, across - 0.5), plane.turned[1]))
     axes.set_ylim(*_turn((down - 0.5, -0.5), plane.turned[0]))

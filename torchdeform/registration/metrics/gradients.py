@@ -13,7 +13,7 @@ from torchdeform.registration.metrics.base import (
     relative_weight,
     times,
 )
-from torchdeform.stencil import KERNELS, derivative
+from torchdeform.stencil import add_adjoint_derivative, derivative
 
 # The smallest edge, in grey levels a voxel of images scaled to [0, 1].
 _SMALLEST_EDGE = 1e-3
@@ -52,7 +52,7 @@ class GradientFields(Similarity):
         value = mean(along.mul_(ratio), weight)
         pull, total = times(2 * ratio, weight), torch.zeros_like(warped)
         for axis, (p, g) in enumerate(zip(self.direction, gradient, strict=True)):
-            _add_adjoint(total, torch.addcmul(p, ratio, g, value=-1).mul_(pull), self.grid, axis)
+            add_adjoint_derivative(total, torch.addcmul(p, ratio, g, value=-1).mul_(pull), self.grid, axis)
         return value, total
 
 
@@ -129,18 +129,3 @@ def _smallest_in_stencil(mask: Tensor | None) -> Tensor | None:
         ends = inner.narrow(axis, 0, 1), inner.narrow(axis, count - 1, 1)
         smallest = torch.minimum(smallest, torch.cat([ends[0], inner, ends[1]], dim=axis))
     return smallest
-
-
-def _add_adjoint(total: Tensor, field: Tensor, grid: Grid, axis: int) -> None:
-    """Add D_aᵀ field to ``total``, D_a being `derivative` along an axis: Σ y D_a x = Σ x D_aᵀ y for all x and y."""
-    interior, first = KERNELS[2]
-    dim, step, last = axis + 2, grid.spacing[axis], field.shape[axis + 2] - 1
-    count = last + 2 - len(interior)
-    inner = field.narrow(dim, len(first), count)
-    for k, w in enumerate(interior):
-        if w:
-            total.narrow(dim, k, count).add_(inner, alpha=w / step)
-    for row, kernel in enumerate(first):
-        for k, w in enumerate(kernel):
-            total.select(dim, k).add_(field.select(dim, row), alpha=w / step)
-            total.select(dim, last - k).add_(field.select(dim, last - row), alpha=-w / step)
