@@ -19,7 +19,7 @@ from torchdeform.grid import Grid
 from torchdeform.image import Image, resample
 from torchdeform.io import read_displacement, read_image, write_image
 
-RESULTS = ["displacement.nii.gz", "inverse.h5", "overview.png", "result.json", "transform.h5"]
+RESULTS = ["displacement.nii.gz", "inverse.h5", "overview.png", "report.html", "result.json", "transform.h5"]
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_pictures_end_to_end(folder, engine, capsys):
     assert main(["fixed.png", "moving.png", "--out", "results/one"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
-    assert 3 <= len(out.splitlines()) <= 5
+    assert 3 <= len(out.splitlines()) <= 6
     for word in ("similarity", "folds", "determinant", "inverse error", "seconds", "results/one"):
         assert word in out
     assert _names(folder / "results" / "one") == sorted([*RESULTS, "warped.png"])
@@ -87,7 +87,7 @@ def test_record_says_what_ran(folder, engine):
     )
     record = json.loads((folder / "moving" / "result.json").read_text(encoding="utf-8"))
     assert (record["settings"]["steps"], record["settings"]["window"]) == ([4, 2], 7)
-    assert set(record["seconds"]) == {"read", "optimise", "write"}
+    assert set(record["seconds"]) == {"read", "optimise", "write", "draw"}
     assert sorted(record["files"]) == _names(folder / "moving")
     assert record["moving"]["path"] == "moving.png"
     assert record["device"].startswith("cuda" if torch.cuda.is_available() else "cpu")
@@ -217,7 +217,7 @@ def test_a_folder_without_permission_is_named(folder, engine, capsys):
 @pytest.mark.parametrize("program", [main, torchdeform])
 def test_version_and_help(program, capsys):
     assert program(["--version"]) == 0
-    assert capsys.readouterr().out == f"torchdeform {__version__}\n"
+    assert capsys.readouterr().out.startswith(f"torchdeform {__version__}, torch {torch.__version__}, ")
     assert program(["--help"]) == 0
     assert "Usage" in capsys.readouterr().out
 

@@ -1,4 +1,4 @@
-"""Interpolation beside SimpleITK's and SciPy's, and what splines promise."""
+"""Interpolation beside SimpleITK's and SciPy's, what splines promise, and how labels are voted on."""
 
 import math
 
@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 import torch
-from scipy.ndimage import map_coordinates
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import convolve1d, map_coordinates
 from torch import Tensor
 from torch.autograd import gradcheck
 
+import torchdeform.interpolation as module
 from torchdeform.errors import InputError
 from torchdeform.grid import Grid
 from torchdeform.interpolation import MODES, interpolator
@@ -31,7 +34,7 @@ def scattered(grid: Grid, count: int, *, beyond: float = 0.0, seed: int = 1) -> 
     return (unit * (1 + 2 * beyond) - beyond) * sides
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", ITK)
 @pytest.mark.parametrize("dim", [2, 3])
 def test_values_are_those_of_simpleitk(dim, mode):
     """Inside, in the half voxel around, and outside, where both put the same value."""
@@ -60,7 +63,7 @@ def test_cubic_is_scipy_s_mirrored_spline(dim):
     torch.testing.assert_close(ours[0], torch.from_numpy(theirs), atol=1e-12, rtol=0)
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", ITK)
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("device", DEVICES)
 def test_nodes_keep_their_values(dim, mode, device):
@@ -118,7 +121,106 @@ def test_gradients_of_cubic(dim):
 
 def test_wrong_arguments_are_refused():
     grid = GRIDS[2]
-    with pytest.raises(InputError, match="one of nearest, linear, cubic"):
+    with pytest.raises(InputError, match="one of nearest, linear, cubic, label"):
         interpolator(random(1, 1, *grid.shape), grid, mode="cubc")
     with pytest.raises(InputError, match="must have shape"):
         interpolator(random(1, 1, 3, 3), grid)
+
+
+# --- labels -----------------------------------------------------------------------------------------------------------
+
+
+def blobs(shape: tuple[int, ...], count: int, *, seed: int = 0) -> Tensor:
+    """Return ``(1, 1, *S)`` with about ``count`` labels that touch, each node having that of the nearest centre."""
+    generator = torch.manual_seed(seed)
+    centres = torch.rand(count, len(shape), generator=generator) * torch.tensor(shape)
+    labels = torch.randint(1, 10**6, (count,), generator=generator).double()
+    labels[0] = 0
+    nodes = Grid(shape).points()[0].flatten(1).T
+    return labels[torch.cdist(nodes, centres).argmin(1)].view(1, 1, *shape)
+
+
+def votes(labels: Tensor, grid: Grid, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the labels there are, and for each (SciPy) its smoothed indicator, interpolated linearly."""
+    known = labels.unique()
+    index = [(points[0, k] / h).clamp(0, n - 1) for k, (h, n) in enumerate(zip(grid.spacing, grid.shape, strict=True))]
+    aside = 1 / (2 + math.exp(2))  # a Gaussian of half a voxel on three nodes
+    found = []
+    for label in known:
+        indicator = (labels[0, 0] == label).double().numpy()
+        for axis in range(grid.dim):
+            indicator = convolve1d(indicator, [aside, 1 - 2 * aside, aside], axis, mode="mirror")
+        found.append(torch.from_numpy(map_coordinates(indicator, torch.stack(index).numpy(), order=1, mode="mirror")))
+    return known, torch.stack(found)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("dim", "count"), [(2, 3), (2, 40), (3, 3), (3, 60)])
+def test_labels_are_those_with_the_largest_indicator(dim, count, device):
+    grid = Grid((19, 17, 18)[:dim], SPACING[:dim])
+    labels, points = blobs(grid.shape, count), scattered(grid, 4000)
+    known, indicators = votes(labels, grid, points)
+    first, second = indicators.topk(2, dim=0).values
+    clear = first - second > 1e-5
+    assert clear.double().mean() > 0.99
+    found = interpolator(labels.to(device), grid, mode="label")(points.to(device))[0, 0].cpu()
+    assert torch.equal(found[clear], known[indicators.argmax(0)][clear])
+    nearest = interpolator(labels, grid, mode="nearest")(points)[0, 0]
+    assert (found != nearest).double().mean() > 0.005
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([(6, 7), (2, 9), (5, 4, 6), (2, 2, 3)]), st.integers(2, 30))
+def test_labels_are_copied(seed, shape, count):
+    """Whatever is asked for is a label that a node near it has."""
+    grid = Grid(shape)
+    labels, points = blobs(shape, count, seed=seed), scattered(grid, 100, beyond=0.3, seed=seed)
+    found = interpolator(labels, grid, mode="label", outside=-1.0)(points)
+    nearest = interpolator(labels, grid, mode="nearest", outside=-1.0)(points)
+    assert torch.equal(found == -1, nearest == -1)
+    assert set(found.unique().tolist()) <= {-1.0, *labels.unique().tolist()}
+    assert not interpolator(labels, grid, mode="label")(grid.points() + 1e4).any()
+
+
+def test_a_smooth_border_stays_smooth():
+    """A disc shifted by fractions of a voxel: fewer nodes are wrong than with the nearest label."""
+    grid = Grid((64, 64))
+
+    def disc(shift: float) -> Tensor:
+        middle = torch.tensor([31.0, 31.0]).view(1, 2, 1, 1) + shift
+        return ((grid.points() - middle).square().sum(1, keepdim=True) < 15.0**2).float()
+
+    wrong = dict.fromkeys(("nearest", "label"), 0)
+    for shift, mode in [(s, m) for s in (0.2, 0.37, 0.5, 0.61) for m in wrong]:
+        found = interpolator(disc(0.0), grid, mode=mode)(grid.points(dtype=torch.float64) - shift)
+        wrong[mode] += int((found != disc(shift)).sum())
+    assert wrong["label"] < 0.8 * wrong["nearest"]
+
+
+def test_what_is_two_voxels_thick_stays():
+    grid = Grid((20, 20, 20))
+    labels = torch.zeros(1, 1, 20, 20, 20)
+    labels[..., 5:7, 3:17, 3:17], labels[..., 12:14, 12:14, 12:14] = 3, 8
+    found = interpolator(labels, grid, mode="label")(grid.points(dtype=torch.float64))
+    assert torch.equal(found, labels.where(labels == 8, found))
+    assert (found == 3).sum() >= 0.95 * (labels == 3).sum()
+
+
+def test_labels_of_several_channels_and_many_points_at_once(monkeypatch):
+    grid = GRIDS[3]
+    labels = torch.cat([blobs(grid.shape, 5, seed=s) for s in range(3)], dim=1)
+    points = torch.cat([scattered(grid, 200, seed=s) for s in range(2)]).unflatten(2, (10, 20))
+    whole = interpolator(labels, grid, mode="label")(points)
+    monkeypatch.setattr(module, "_POINTS_AT_ONCE", 7)
+    assert torch.equal(interpolator(labels, grid, mode="label")(points), whole)
+    for channel in range(3):
+        alone = interpolator(labels[:, channel : channel + 1], grid, mode="label")(points)
+        assert torch.equal(alone, whole[:, channel : channel + 1])
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_labels_that_are_not_finite_are_refused(value):
+    labels = blobs((6, 7), 3)
+    labels[0, 0, 2, 2] = value
+    with pytest.raises(InputError, match="labels must be finite numbers"):
+        interpolator(labels, Grid((6, 7)), mode="label")

@@ -12,7 +12,7 @@ LAYERS = [
     ["cli", "commands", "batch"],
     ["pair", "deform"],
     ["check", "memory"],
-    ["config", "nn", "io", "report"],
+    ["config", "citations", "nn", "io", "report"],
     ["registration"],
     ["deformation"],
     ["flow", "diagnostics"],
@@ -30,7 +30,7 @@ HOMES = {
     "matplotlib": {"report"},
     "typer": {"cli", "commands"},
     "rich": {"cli", "commands"},
-    "pydantic": {"config"},
+    "pydantic": {"config", "batch"},
     "yaml": {"config"},
     "kornia": {"warp", "image"},
 }

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import torchdeform.memory as memory
 from torchdeform.errors import InputError
 from torchdeform.grid import Grid
-from torchdeform.memory import available, estimate, fitting_grid, parse_size, readable
+from torchdeform.memory import available, estimate, fitting_grid, parse_size, peak, readable
 from torchdeform.registration.pyramid import MIN_NODES
 from torchdeform.registration.settings import SIMILARITIES
 
@@ -148,3 +148,22 @@ def test_what_is_free_on_a_gpu():
     free = available("cuda")
     assert free is not None
     assert 0 < free <= torch.cuda.get_device_properties(0).total_memory
+
+
+@linux
+def test_the_peak_is_that_of_the_process():
+    """At least what Linux says it holds now, and no smaller after more."""
+    before = peak()
+    assert before is not None
+    held = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * 4096
+    assert 0.9 * held <= before < 2**40
+    block = torch.ones(2**24)
+    after = peak()
+    assert after is not None
+    assert after >= before
+    del block
+
+
+def test_the_peak_is_not_known_everywhere(monkeypatch):
+    monkeypatch.setitem(sys.modules, "resource", None)
+    assert peak() is None

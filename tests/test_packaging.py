@@ -28,7 +28,8 @@ def test_wheel_holds_what_is_needed(wheel, root):
         names = set(archive.namelist())
     presets = {f"torchdeform/configs/presets/{p.name}" for p in (root / "configs" / "presets").iterdir()}
     modules = {str(p.relative_to(root)) for p in (root / "torchdeform").rglob("*.py")}
-    assert presets | modules | {"torchdeform/py.typed"} <= names
+    templates = {f"torchdeform/report/templates/report.{kind}" for kind in ("html", "css", "js")}
+    assert presets | modules | templates | {"torchdeform/py.typed", "torchdeform/references.bib"} <= names
     assert not any(name.startswith(("tests/", "configs/")) for name in names)
 
 
@@ -62,6 +63,7 @@ def test_constraints_cover_what_is_declared(root):
 
     project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     declared = project["dependencies"] + project["optional-dependencies"]["test"]
+    declared += project["optional-dependencies"]["docs"]
     pinned = (root / "constraints.txt").read_text(encoding="utf-8").lower()
     missing = [d for d in declared if not re.search(rf"^{re.split('[<>=;]', d)[0].lower()}==", pinned, re.MULTILINE)]
     assert not missing

@@ -57,7 +57,7 @@ def point_error(pair: Pair, affine: Affine) -> float:
     [
         ("mouse_brain_3d", 0.85),  # 0.11 before
         ("hippocampus_3d", 0.75),  # 0.56 before
-        ("mindboggle_2d", 0.38),  # 0.37 before
+        ("mindboggle_2d", 0.39),  # 0.37 before
         ("heart_2d", 0.79),  # 0.80 before: hardly anything to align
         ("spine_t1t2_3d", 0.72),  # 0.72 before: two contrasts
     ],
@@ -79,4 +79,4 @@ def test_stains_of_turned_and_torn_sections(data_folder):
         before.append(point_error(pair, Affine.identity(2)))
         after.append(point_error(pair, aligned(pair)[1].affine))
     assert all(a < 0.65 * b for a, b in zip(after, before, strict=True))
-    assert sum(after) / len(after) <= 10.0  # 19.8 before; the best fits leave 7.1
+    assert sum(after) / len(after) <= 9.3  # 19.8 before; the best fits leave 7.1

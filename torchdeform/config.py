@@ -10,6 +10,10 @@ from torchdeform.errors import InputError, nearest_name, require_choice
 from torchdeform.registration.settings import RegistrationSettings
 
 _PRESETS = "presets"
+_MOST_ENTRIES = 300_000  # of a YAML file, those that aliases repeat counted again
+_DEEPEST = 50  # mappings and lists inside one another
+
+Lines = dict[tuple[str | int, ...], int]
 
 
 def load_settings(
@@ -23,6 +27,9 @@ def load_settings(
         preset: one of `preset_names`.
         file: YAML file with some of the fields of `RegistrationSettings`.
         overrides: values by field name; ``"a.b"`` names field ``b`` of field ``a``.
+
+    Returns:
+        The settings, typed and checked.
 
     Raises:
         InputError: unknown preset or key (the nearest name is given), a file that is missing or no YAML, or a
@@ -61,7 +68,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     import yaml
 
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), _unique_keys_loader())
+        content = _load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}; check the name of the settings file") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -93,11 +100,70 @@ def parse_override(text: str) -> tuple[str, object]:
         raise InputError(f"--set {key.strip()}: {value!r} is no valid value; lists are written [40, 20]") from error
 
 
-def _unique_keys_loader() -> type:
-    """Return PyYAML's safe loader, made to refuse a key that is given twice (it would keep the last in silence)."""
+def read_yaml_lines(path: Path) -> Lines:
+    """Return the line, from 1, of every key and list item of a YAML file, by the keys and positions that lead to it.
+
+    Raises:
+        InputError: aliases that repeat themselves, or each other, without end.
+
+    Notes:
+        For a file that `read_yaml` has read.
+    """
     import yaml
 
-    class Loader(yaml.SafeLoader):
+    lines: Lines = {}
+    whole = yaml.compose(path.read_text(encoding="utf-8"), _safe_loader())
+    open_nodes: list[tuple[tuple[str | int, ...], Any]] = [((), whole)]
+    while open_nodes:
+        keys, node = open_nodes.pop()
+        for key, child, mark in _children(node):
+            if len(lines) + len(open_nodes) > _MOST_ENTRIES or len(keys) > _DEEPEST:
+                raise InputError(f"{path} repeats its aliases too often; write out what they stand for")
+            lines.setdefault((*keys, *key), mark.line + 1)
+            open_nodes.append(((*keys, *key), child))
+    return lines
+
+
+def _children(node: object) -> list[tuple[tuple[str | int, ...], Any, Any]]:
+    """Return key (none for what ``<<`` merges in), node and place of what stands in a YAML mapping or list."""
+    import yaml
+
+    if isinstance(node, yaml.MappingNode):
+        return [(() if key.value == "<<" else (key.value,), value, key.start_mark) for key, value in node.value]
+    if isinstance(node, yaml.SequenceNode):
+        return [((position,), value, value.start_mark) for position, value in enumerate(node.value)]
+    return []
+
+
+def to_yaml(content: Mapping[str, object]) -> str:
+    """Return plain values as YAML text, keys in their order."""
+    import yaml
+
+    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True, width=120)
+
+
+def _safe_loader() -> Any:
+    """Return PyYAML's safe loader, the fast one in C where there is one."""
+    import yaml
+
+    return getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+def _load(text: str) -> Any:
+    """Return what a YAML text holds; the slow loader has the better word, and line, for what is wrong."""
+    import yaml
+
+    try:
+        return yaml.load(text, _unique_keys_loader(_safe_loader()))
+    except yaml.YAMLError:
+        return yaml.load(text, _unique_keys_loader(yaml.SafeLoader))
+
+
+def _unique_keys_loader(base: Any) -> type:
+    """Return a safe loader of PyYAML, made to refuse a key that is given twice (it would keep the last in silence)."""
+    import yaml
+
+    class Loader(base):
         def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
             keys = [self.construct_object(key, deep=deep) for key, _ in node.value]
             for position, key in enumerate(keys):

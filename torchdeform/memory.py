@@ -2,6 +2,7 @@
 
 import math
 import re
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from torchdeform.registration.settings import similarity_weights
 
 _UNITS = {"": 1, "k": 1e3, "m": 1e6, "g": 1e9, "t": 1e12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
 _SIZE = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([kmgt]i?)?b?\s*", re.IGNORECASE)
+
+_PEAK_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes that ru_maxrss counts in
 
 _SHRINK = 0.97  # steps in which the grid that fits is sought, per axis
 
@@ -69,6 +72,15 @@ def available(device: torch.device | str = "cpu") -> int | None:
         return int(torch.cuda.mem_get_info(device)[0])
     known = [room for room in (_free(), *_group_rooms()) if room is not None]
     return max(0, min(known)) if known else None
+
+
+def peak() -> int | None:
+    """Return the most bytes of memory that this process has held so far, None if that cannot be known."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return None
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _PEAK_UNIT
 
 
 def _free() -> int | None:

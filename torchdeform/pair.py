@@ -9,13 +9,14 @@ import torch
 
 from torchdeform.check import WARNING, preflight
 from torchdeform.errors import ComputationError, InputError, require_choice
-from torchdeform.image import Image
+from torchdeform.image import Image, resample
 from torchdeform.io import read_image, write_displacement, write_image, write_transform
 from torchdeform.io.files import require_writable, staged
 from torchdeform.io.images import ending_like
 from torchdeform.io.labels import read_labels, write_labels
 from torchdeform.io.points import matched, read_points
-from torchdeform.memory import available, estimate, fitting_grid, readable
+from torchdeform.memory import available, estimate, fitting_grid, peak, readable
+from torchdeform.registration.evaluation import common_labels
 from torchdeform.registration.guidance import Guidance
 from torchdeform.registration.intensities import corresponding_channels
 from torchdeform.registration.pyramid import restrict
@@ -23,11 +24,15 @@ from torchdeform.registration.refine import onto_grid
 from torchdeform.registration.result import Callback, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.overview import write_overview
+from torchdeform.report.page import write_report
 from torchdeform.report.record import describe, write_json
+from torchdeform.report.scene import make_scene
+from torchdeform.report.shell import repeat_command
 from torchdeform.transform import Transform
 
 DEVICES = ("auto", "cpu", "cuda")
 RECORD = "result.json"
+REPORT = "report.html"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +132,7 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings) -> Inputs:
     )
     report.require_ok()
     corresponding_channels(fixed, moving)
-    labels = [None if path is None else read_labels(path) for path in (files.fixed_labels, files.moving_labels)]
+    labels = _read_labels(files, fixed)
     points = _read_points(files, fixed, moving)
     guidance = Guidance(
         fixed_mask=masks[0],
@@ -139,6 +144,16 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings) -> Inputs:
     )
     guidance.require_images(fixed.grid.dim)
     return Inputs(fixed, moving, guidance, report.of(WARNING))
+
+
+def _read_labels(files: PairFiles, fixed: Image) -> tuple[Image, Image] | tuple[None, None]:
+    """Return the labels of both images, which must have some in common where the fixed image is."""
+    if files.fixed_labels is None or files.moving_labels is None:
+        return None, None
+    first, second = read_labels(files.fixed_labels), read_labels(files.moving_labels)
+    Guidance(fixed_labels=first, moving_labels=second).require_images(fixed.grid.dim)
+    common_labels(resample(first, fixed, mode="nearest"), second.data, names=(first.name, second.name))
+    return first, second
 
 
 def _read_points(
@@ -180,14 +195,24 @@ def register_files(
     require_writable(files.out)
     inputs = read_inputs(files, settings)
     work, notes = _fitted(inputs.fixed, settings, memory, where)
-    read = perf_counter() - start
+    run = _Run(memory, {"read": perf_counter() - start}, {"read": peak()})
     result = register(
         work.to(where), inputs.moving.to(where), settings, guidance=inputs.guidance.to(where), callback=callback
     )
     if work is not inputs.fixed:
         result = onto_grid(result, inputs.fixed.to(where), inputs.moving.to(where), inputs.guidance.to(where))
     _require_finite(result)
-    return _publish(files, replace(inputs, warnings=(*inputs.warnings, *notes)), result, read)
+    run.held[next(reversed(result.seconds), "register")] = peak()
+    return _publish(files, replace(inputs, warnings=(*inputs.warnings, *notes)), result, run)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What a run was allowed, what its stages took, and the most that the process had held when they ended."""
+
+    memory: int | None
+    seconds: dict[str, float]
+    held: dict[str, int | None]
 
 
 def _fitted(
@@ -217,25 +242,42 @@ def _require_finite(result: RegistrationResult) -> None:
         raise ComputationError("the registration diverged: its map is not finite; try --preset default without --set")
 
 
-def _publish(files: PairFiles, inputs: Inputs, result: RegistrationResult, read: float) -> Outcome:
+def _publish(files: PairFiles, inputs: Inputs, result: RegistrationResult, run: _Run) -> Outcome:
     """Write every file of a result into the folder, all of them or none."""
     out, start = files.out, perf_counter()
     former = _former_files(out)
-    warnings = (*inputs.warnings, *(result.alignment.warnings if result.alignment else ()))
     with staged(out) as folder:
         _write_images(folder, files, inputs, result)
-        names = (*sorted(path.name for path in folder.iterdir()), RECORD)
-        seconds = {"read": read, **result.seconds, "write": perf_counter() - start}
-        record = describe(result, inputs.fixed, inputs.moving) | {
-            "inputs": {f.name: str(path) for f in fields(files) if (path := getattr(files, f.name)) is not None},
-            "warnings": warnings,
-            "seconds": seconds,
-            "files": names,
-        }
+        written = perf_counter()
+        scene = make_scene(inputs.fixed, inputs.moving, result)
+        write_overview(folder / "overview.png", scene)
+        names = (*sorted([*(path.name for path in folder.iterdir()), REPORT]), RECORD)
+        run.seconds.update(result.seconds, write=written - start, draw=perf_counter() - written)
+        run.held["draw"] = peak()
+        record = _record(files, inputs, result, run) | {"files": names}
+        write_report(folder / REPORT, scene, record)
         write_json(record, folder / RECORD)
     for name in former - set(names):
         (out / name).unlink(missing_ok=True)
-    return Outcome(result, record, out, names, seconds, warnings)
+    return Outcome(result, record, out, names, run.seconds, _warnings(inputs, result))
+
+
+def _record(files: PairFiles, inputs: Inputs, result: RegistrationResult, run: _Run) -> dict[str, object]:
+    """Return the record of a result, with what is known of the files and the run."""
+    given = {f.name: str(path) for f in fields(files) if (path := getattr(files, f.name)) is not None}
+    device = result.displacement.device.type
+    return describe(result, inputs.fixed, inputs.moving) | {
+        "inputs": given,
+        "warnings": _warnings(inputs, result),
+        "seconds": run.seconds,
+        "memory": run.held,
+        "command": repeat_command(given, result.settings, device, run.memory),
+        "folder": str(Path.cwd()),
+    }
+
+
+def _warnings(inputs: Inputs, result: RegistrationResult) -> tuple[str, ...]:
+    return (*inputs.warnings, *(result.alignment.warnings if result.alignment else ()))
 
 
 def _write_images(folder: Path, files: PairFiles, inputs: Inputs, result: RegistrationResult) -> None:
@@ -251,8 +293,6 @@ def _write_images(folder: Path, files: PairFiles, inputs: Inputs, result: Regist
     if files.moving_labels is not None and isinstance(inputs.guidance.moving_labels, Image):
         carried = transform.labels(inputs.guidance.moving_labels, fixed)
         write_labels(carried, folder / f"warped_labels{ending_like(files.moving_labels, carried)}")
-    before = moving if result.affine is None else Transform((result.affine,)).image(moving, fixed)
-    write_overview(folder / "overview.png", fixed, before, result)
 
 
 def _former_files(out: Path) -> set[str]:

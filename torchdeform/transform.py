@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchdeform.errors import InputError
 from torchdeform.image import Image, overlap
-from torchdeform.interpolation import interpolator
+from torchdeform.interpolation import LABEL_MODE, interpolator
 from torchdeform.stencil import jacobian_determinant
 from torchdeform.warp import invert, sample
 
@@ -290,7 +290,7 @@ class Transform:
         Args:
             moving: image in the moving space, any grid and any number of channels.
             reference: whose grid the result is wanted on; `reference` of this transform when None.
-            mode: ``nearest``, ``linear`` or ``cubic``; see `torchdeform.interpolation.interpolator`.
+            mode: ``nearest``, ``linear``, ``cubic`` or ``label``; see `torchdeform.interpolation.interpolator`.
             outside: value where φ(x) is outside the moving image (ITK's resampler uses 0); None continues its edge.
 
         Returns:
@@ -301,7 +301,7 @@ class Transform:
 
         Notes:
             One interpolation only, whatever the number of stages; coordinates in float64. Differentiable in the moving
-            pixels, the fields and the matrices (not with ``nearest``).
+            pixels, the fields and the matrices (not with ``nearest`` and ``label``).
         """
         place = self._reference(reference)
         self._check(moving, self.moving, "moving")
@@ -309,13 +309,21 @@ class Transform:
         pixels = _over_nodes(place, lambda nodes: at(moving.to_grid(self.points(nodes))), moving.data.device)
         return replace(place, data=pixels, name=moving.name, pixel_type=moving.pixel_type)
 
-    def labels(self, moving: Image, reference: Image | None = None) -> Image:
-        """Return the labels of the moving image in the fixed space: `image` with ``nearest`` and 0 outside.
+    def labels(self, moving: Image, reference: Image | None = None, *, mode: str = LABEL_MODE) -> Image:
+        """Return the labels of the moving image in the fixed space: `image` by a vote around each point, 0 outside.
+
+        Args:
+            moving: whole numbers in the moving space.
+            reference: as in `image`.
+            mode: ``label``, whose borders stay smooth, or ``nearest``, which keeps the thinnest parts.
+
+        Raises:
+            InputError: as `image`; labels that are not finite.
 
         Notes:
             Values are copied, never computed, so integers stay integers; labels above 2²⁴ want float64 ``data``.
         """
-        return self.image(moving, reference, mode="nearest")
+        return self.image(moving, reference, mode=mode)
 
     def flatten(self, reference: Image | None = None) -> Displacement:
         """Return the whole chain as one displacement on a grid, u = to_grid(φ(to_world(x))) − x.

@@ -1,276 +1,288 @@
 """Register pairs of real images with this project and with other tools, from the raw files, and judge the maps alike.
 
-    python scripts/benchmarks/peers.py --sets mouse_brain_3d --tools torchdeform greedy ants_syncc --json peers.json
+    python scripts/benchmarks/peers.py --sets mouse_brain_3d --tools torchdeform greedy ants_syn --json peers.json
 
-Each run is a process of its own with two threads; the tools take turns pair by pair, so that a machine that drifts is
-fair to all. A tool hands over its map as positions φ(x) of the fixed voxels: it resamples images whose values are the
-coordinates of the moving space, so its own resampler says where it takes points. Labels are carried by one
-nearest-neighbour code for all. Seconds count from the first call into the tool, files read and imports done, to its
-map. Folds are those of the map, by central differences and by the full certificate; a table in Markdown is printed.
+Each run is a process of its own on two cores with two threads. The tools take turns pair by pair, so that a machine
+that drifts is fair to all. What is there in the JSON file already is not run again, so a long benchmark can be made in
+pieces, and printed without running anything (``--print``).
+
+Clock. Every file is first made an image of one channel of float32, without compression (colours as their luminance),
+the same files for all. *Start-up* runs from the start of the interpreter until the tool is imported. *Seconds* run from
+then until its map lies on disk in the tool's own form: files read, images aligned, map found and written. Nobody warps
+images or labels, draws, or judges within them; ours finds the inverse and the certificate too, because `register`
+always does. *GiB* is the peak of the process at that moment.
+
+Judgement. A map is read off as positions of the fixed voxels, by the tool's own resampler or from the field it wrote
+(see `peer_tools`). Labels are carried by one nearest-neighbour code for all. Folds are those of the whole map.
 """
 
 import argparse
 import json
 import os
-import resource
+import shlex
+import shutil
 import subprocess
 import sys
-import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
-from importlib import import_module
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from datetime import date
+from importlib import import_module, metadata
 from pathlib import Path
 from statistics import mean, median
-from time import perf_counter
+from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
-import SimpleITK as sitk
+from machine import describe_machine, peak_bytes
 from pairs import SETS, Pair
+from peer_tools import TOOLS, Job, limit_threads, load
 
-_REACH = 0.5  # the images of coordinates reach this share of the moving image beyond its sides
-_THREADS = "2"
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.append(str(ROOT))
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS")
 
-Register = Callable[[sitk.Image, sitk.Image, Path], Callable[[sitk.Image], sitk.Image]]
+Row = dict[str, Any]
+
+# What the table shows of a figure over the pairs.
+_COLUMNS = {
+    "Dice": ("dice", lambda v: f"{median(v):.4f} ({mean(v):.4f})"),
+    "landmarks, mean": ("landmark_mean", lambda v: f"{median(v):.2f} ({mean(v):.2f})"),
+    "landmarks, median": ("landmark_median", lambda v: f"{median(v):.2f} ({mean(v):.2f})"),
+    "folds": ("folds", lambda v: f"{max(v):.0f}"),
+    "central folds": ("central_folds", lambda v: f"{max(v):.0f}"),
+    "sd log J": ("log_det_std", lambda v: f"{median(v):.3f}"),
+    "seconds": ("seconds", lambda v: f"{median(v):.1f}"),
+    "start-up": ("startup", lambda v: f"{median(v):.1f}"),
+    "GiB": ("GiB", lambda v: f"{max(v):.2f}"),
+}
+_EACH = (("dice", ".4f"), ("landmark_mean", ".2f"))
 
 
-def read_grey(path: Path) -> sitk.Image:
+def prepare(pair: Pair, folder: Path) -> Job:
+    """Write the images of a pair, and its masks, as every tool gets them."""
+    import SimpleITK as sitk
+
+    files = {}
+    for name in ("fixed", "moving", "fixed_mask", "moving_mask"):
+        if source := getattr(pair, name):
+            image = sitk.ReadImage(str(source))
+            image = sitk.Cast(image > 0, sitk.sitkUInt8) if "mask" in name else _grey(image)
+            files[name] = folder / f"{name}.nii"
+            sitk.WriteImage(image, str(files[name]))
+    return Job(files.pop("fixed"), files.pop("moving"), folder, **files)
+
+
+def _grey(image: Any) -> Any:
     """Return an image with one channel of float32."""
-    image = sitk.ReadImage(str(path))
+    import SimpleITK as sitk
+
     if image.GetNumberOfComponentsPerPixel() > 1:
         red, green, blue = (sitk.VectorIndexSelectionCast(image, k, sitk.sitkFloat32) for k in range(3))
         image = 0.299 * red + 0.587 * green + 0.114 * blue
     return sitk.Cast(image, sitk.sitkFloat32)
 
 
-def coordinates(moving: sitk.Image) -> list[sitk.Image]:
-    """Return images of the world's x, y (and z) on a coarse grid that reaches beyond the moving image."""
-    size, nodes = np.array(moving.GetSize(), dtype=float), 33
-    spacing = (1 + 2 * _REACH) * size / (nodes - 1) * moving.GetSpacing()
-    origin = moving.TransformContinuousIndexToPhysicalPoint((-_REACH * size).tolist())
-    place = [nodes] * len(size), origin, spacing.tolist(), moving.GetDirection()
-    points = sitk.PhysicalPointSource(sitk.sitkVectorFloat32, *place)
-    return [sitk.VectorIndexSelectionCast(points, k) for k in range(len(size))]
-
-
-def ants_tool(kind: str) -> Register:
-    """ANTsPy's `registration` as it comes, affine included."""
-
-    def register(fixed: sitk.Image, moving: sitk.Image, folder: Path) -> Callable[[sitk.Image], sitk.Image]:
-        ants = import_module("ants")
-
-        def convert(image: sitk.Image, name: str) -> Any:
-            sitk.WriteImage(image, str(folder / f"{name}.nii.gz"))
-            return ants.image_read(str(folder / f"{name}.nii.gz"))
-
-        still, other = convert(fixed, "fixed"), convert(moving, "moving")
-        found = ants.registration(still, other, type_of_transform=kind)
-
-        def resample(image: sitk.Image) -> sitk.Image:
-            out = ants.apply_transforms(still, convert(image, "coordinate"), found["fwdtransforms"], defaultvalue=1e6)
-            ants.image_write(out, str(folder / "out.nii.gz"))
-            return sitk.ReadImage(str(folder / "out.nii.gz"), sitk.sitkFloat32)
-
-        return resample
-
-    return register
-
-
-def greedy_tool(metric: str, options: str = "", affine_metric: str = "NMI", moments: int = 0) -> Register:
-    """Greedy: moments of this order or the centres of the images, affine, then its deformable stage."""
-
-    def register(fixed: sitk.Image, moving: sitk.Image, folder: Path) -> Callable[[sitk.Image], sitk.Image]:
-        picsl_greedy = import_module("picsl_greedy")
-
-        dim = fixed.GetDimension()
-        tool = {2: picsl_greedy.Greedy2D, 3: picsl_greedy.Greedy3D}[dim]()
-        names = [str(folder / f"{name}.nii.gz") for name in ("fixed", "moving")]
-        for image, name in zip((fixed, moving), names, strict=True):
-            sitk.WriteImage(image, name)
-        pair, threads = " ".join(names), f"-threads {_THREADS}"
-        affine, warp, start = folder / "affine.mat", folder / "warp.nii.gz", "-ia-image-centers"
-        if moments:
-            start = f"-ia {folder / 'moments.mat'}"
-            tool.execute(f"-moments {moments} -i {pair} -o {folder / 'moments.mat'} {threads}")
-        tool.execute(f"-a -dof 12 -m {affine_metric} -n 100x50x10 -i {pair} {start} -o {affine} {threads}")
-        tool.execute(f"-m {metric} -n 100x50x20 {options} -i {pair} -it {affine} -o {warp} {threads}")
-
-        def resample(image: sitk.Image) -> sitk.Image:
-            source, target = folder / "coordinate.nii.gz", folder / "out.nii.gz"
-            sitk.WriteImage(image, str(source))
-            tool.execute(f"-rf {names[0]} -rb 1e6 -rm {source} {target} -r {warp} {affine} {threads}")
-            return sitk.ReadImage(str(target), sitk.sitkFloat32)
-
-        return resample
-
-    return register
-
-
-def torchdeform_tool(preset: str) -> Register:
-    """This project's `register` on files, alignment included."""
-
-    def register(fixed: sitk.Image, moving: sitk.Image, folder: Path) -> Callable[[sitk.Image], sitk.Image]:
-        from torchdeform.cli import main
-
-        names = [str(folder / f"{name}.nii.gz") for name in ("fixed", "moving")]
-        for image, name in zip((fixed, moving), names, strict=True):
-            sitk.WriteImage(image, name)
-        if main([*names, "--out", str(folder / "out"), "--preset", preset, "--quiet"]):
-            raise SystemExit(1)
-        transform = sitk.ReadTransform(str(folder / "out" / "transform.h5"))
-        return lambda image: sitk.Resample(image, fixed, transform, sitk.sitkLinear, 1e6)
-
-    return register
-
-
-TOOLS: dict[str, Register] = {
-    "torchdeform": torchdeform_tool("default"),
-    "torchdeform_fast": torchdeform_tool("fast"),
-    "greedy": greedy_tool("NCC 2x2x2"),
-    "greedy_ncc": greedy_tool("NCC 2x2x2", affine_metric="NCC 2x2x2"),
-    "greedy_moments": greedy_tool("NCC 2x2x2", moments=1),
-    "greedy_moments_2": greedy_tool("NCC 2x2x2", moments=2),
-    "greedy_wncc": greedy_tool("WNCC 2x2x2", "-sv"),
-    "ants_syn": ants_tool("SyN"),
-    "ants_syncc": ants_tool("SyNCC"),
-    "ants_affine": ants_tool("Affine"),
-}
-
-
-def run_one(name: str, pair: Pair) -> dict[str, float]:
-    """Register a pair in this process and judge the map."""
-    fixed, moving = read_grey(pair.fixed), read_grey(pair.moving)
-    with tempfile.TemporaryDirectory() as folder:
-        start = perf_counter()
-        resample = TOOLS[name](fixed, moving, Path(folder))
-        seconds = perf_counter() - start
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-        moved = [sitk.GetArrayFromImage(resample(image)) for image in coordinates(moving)]
-    positions = np.stack(moved, axis=-1).astype(np.float64)
-    return {"seconds": seconds, "GiB": memory} | judge(pair, fixed, positions)
-
-
-def judge(pair: Pair, fixed: sitk.Image, positions: np.ndarray) -> dict[str, float]:
-    """Return overlap, landmark error and folds of a map given as ``(*S, D)`` world positions."""
-    figures = folds(fixed, positions)
-    if pair.fixed_labels and pair.moving_labels:
-        figures |= overlap(pair.fixed_labels, pair.moving_labels, positions)
-    if pair.fixed_points and pair.moving_points:
-        figures |= landmarks((pair.fixed_points, pair.moving_points), fixed, positions)
-    return figures
-
-
-def overlap(fixed_path: Path, moving_path: Path, positions: np.ndarray) -> dict[str, float]:
-    """Return the mean Dice over the labels that both images have, before (in place) and after."""
-    fixed, moving = sitk.ReadImage(str(fixed_path)), sitk.ReadImage(str(moving_path))
-    first = sitk.GetArrayFromImage(fixed).reshape(*positions.shape[:-1], -1)[..., 0]
-    second = sitk.GetArrayFromImage(moving)
-    second = second.reshape(*moving.GetSize()[::-1], -1)[..., 0]
-    direction = np.array(moving.GetDirection()).reshape(len(moving.GetSize()), -1)
-    index = (positions - moving.GetOrigin()) @ np.linalg.inv(direction).T / moving.GetSpacing()
-    index = np.rint(index).astype(int)[..., ::-1]
-    inside = ((index >= 0) & (index < second.shape)).all(-1)
-    carried = np.where(inside, second[tuple(np.moveaxis(np.where(inside[..., None], index, 0), -1, 0))], 0)
-    common = (set(np.unique(first)) & set(np.unique(second))) - {0}
-    return {
-        "dice": mean(
-            2 * ((first == k) & (carried == k)).sum() / ((first == k).sum() + (carried == k).sum()) for k in common
-        )
-    }
-
-
-def read_points(path: Path) -> dict[str, np.ndarray]:
-    """Return points by name: elastix' text (world), or `number,X,Y` in pixels of size 1."""
-    lines = path.read_text(encoding="utf-8").split("\n")
-    if path.suffix == ".csv":
-        rows = [line.split(",") for line in lines[1:] if line.strip()]
-        return {row[0]: np.array(row[1:], dtype=float) for row in rows}
-    return {str(k): np.array(line.split(), dtype=float) for k, line in enumerate(lines[2:]) if line.strip()}
-
-
-def landmarks(files: tuple[Path, Path], fixed: sitk.Image, positions: np.ndarray) -> dict[str, float]:
-    """Return mean and median distance of the moved fixed points from their partners."""
-    first, second = map(read_points, files)
-    names = [name for name in first if name in second]
-    frame = sitk.GetImageFromArray(positions, isVector=True)
-    frame.CopyInformation(fixed)
-    errors = []
-    for name in names:
-        index = np.clip(fixed.TransformPhysicalPointToContinuousIndex(first[name]), 0, np.array(fixed.GetSize()) - 1)
-        place = fixed.TransformContinuousIndexToPhysicalPoint(index.tolist())
-        errors.append(float(np.linalg.norm(frame.EvaluateAtPhysicalPoint(place) - second[name])))
-    return {"landmark_mean": mean(errors), "landmark_median": median(errors)}
-
-
-def folds(fixed: sitk.Image, positions: np.ndarray) -> dict[str, float]:
-    """Return folds by central differences and by the certificate, and the deviation of log J."""
-    import torch
-
-    import torchdeform as td
-
-    dim = fixed.GetDimension()
-    direction = np.array(fixed.GetDirection()).reshape(dim, dim)
-    own = ((positions - fixed.GetOrigin()) @ np.linalg.inv(direction).T)[..., ::-1]
-    grid = td.Grid(fixed.GetSize()[::-1], fixed.GetSpacing()[::-1])
-    phi = torch.from_numpy(np.moveaxis(own, -1, 0).copy())[None]
-    found = td.diagnose(phi - grid.points(dtype=phi.dtype), grid)
-    return {
-        "folds": float(found.folds),
-        "central_folds": float(found.central_folds),
-        "log_det_std": float(found.det_log_std),
-    }
-
-
-def run_apart(name: str, pair: Pair) -> dict[str, Any]:
-    """Run one tool on one pair in a process of its own."""
-    threads = ("OMP_NUM_THREADS", "ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS", "MKL_NUM_THREADS")
-    files = {key: str(value) for key, value in asdict(pair).items() if value is not None}
-    command = [sys.executable, __file__, "--one", name, json.dumps(files)]
-    environment = os.environ | dict.fromkeys(threads, _THREADS)
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+def run_here(order: Row) -> Row:
+    """Register a pair in this process, which is fresh, and judge the map; ``order`` as `run_apart` writes it."""
+    tool, job = TOOLS[order["tool"]], Job(**_paths(order["job"]))
+    limit_threads(job.threads)
     try:
-        return json.loads(done.stdout.splitlines()[-1])
-    except (IndexError, ValueError):
-        return {"failed": (done.stderr.strip().splitlines() or ["no output"])[-1]}
+        load(tool)
+    except ImportError as error:
+        return {"failed": f"not installed: {error}"}
+    startup, start = time.time() - order["started"], time.perf_counter()
+    mapped = tool.register(job)
+    figures = {"startup": startup, "seconds": time.perf_counter() - start, "GiB": peak_bytes() / 2**30}
+    from judge import judge
+
+    return figures | judge(Pair(**_paths(order["pair"])), mapped())
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Return mean quality and median cost of each set and tool as Markdown."""
-    columns = ("dice", "landmark_mean", "landmark_median", "folds", "central_folds", "log_det_std", "seconds", "GiB")
-    lines = ["| set | tool | pairs | " + " | ".join(columns) + " |", "|---" * (len(columns) + 3) + "|"]
-    for which, tool in dict.fromkeys((row["set"], row["tool"]) for row in rows):
-        own = [row for row in rows if (row["set"], row["tool"]) == (which, tool) and "failed" not in row]
-        cells = []
-        for column in columns:
-            values = [row[column] for row in own if column in row]
-            summary = median if column in ("seconds", "GiB") else mean
-            cells.append(f"{summary(values):.4g}" if values else "")
-        lines.append(f"| {which} | {tool} | {len(own)} | " + " | ".join(cells) + " |")
+def _paths(files: Row) -> Row:
+    """Return the arguments of a `Pair` or a `Job` with their paths as such again."""
+    plain = ("name", "device", "threads")
+    return {key: value if key in plain or value is None else Path(value) for key, value in files.items()}
+
+
+def run_apart(name: str, pair: Pair, job: Job, limit: float) -> Row:
+    """Run one tool on one pair in a process of its own."""
+    order, answer = job.folder / "order.json", job.folder / "answer.json"
+    content = {"tool": name, "pair": asdict(pair), "job": asdict(job), "started": time.time()}
+    order.write_text(json.dumps(content, default=str), encoding="utf-8")
+    command = [sys.executable, __file__, "--one", str(order), str(answer)]
+    environment = os.environ | _environment(job)
+    try:
+        done = subprocess.run(
+            command, env=environment, capture_output=True, text=True, errors="replace", check=False, timeout=limit
+        )
+    except subprocess.TimeoutExpired:
+        return {"failed": f"not done after {limit:.0f} s"}
+    if answer.exists():
+        return json.loads(answer.read_text(encoding="utf-8"))
+    last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+    return {"failed": f"exit {done.returncode}: {last[:200]}"}
+
+
+def _environment(job: Job) -> dict[str, str]:
+    """Return the variables that a tool's process is given."""
+    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    return dict.fromkeys(_THREADS, str(job.threads)) | {"PYTHONPATH": path, "TMPDIR": str(job.folder)}
+
+
+def version(package: str) -> str:
+    """Return the version of a distribution; of ours, which need not be installed, the commit too."""
+    if package == "torchdeform":
+        return f"{import_module(package).__version__} {_commit()}".strip()
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _commit() -> str:
+    """Return the commit of this folder, with a mark if files differ from it; nothing where git does not know it."""
+    if shutil.which("git") is None:
+        return ""
+    command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+
+class Book:
+    """The runs so far, in a JSON file if one is given.
+
+    Args:
+        file: read if it exists, written after every run.
+    """
+
+    def __init__(self, file: Path | None) -> None:
+        self.file = file
+        self.rows: list[Row] = json.loads(file.read_text(encoding="utf-8")) if file and file.exists() else []
+
+    def drop(self, tools: Sequence[str]) -> None:
+        """Forget the runs of these tools."""
+        self.rows = [row for row in self.rows if row["tool"] not in tools]
+
+    def holds(self, key: Row) -> bool:
+        return any(key.items() <= row.items() for row in self.rows)
+
+    def add(self, row: Row) -> None:
+        self.rows.append(row)
+        print(json.dumps(row), file=sys.stderr, flush=True)
+        if self.file:
+            fresh = self.file.with_suffix(".part")
+            fresh.write_text(json.dumps(self.rows, indent=1), encoding="utf-8")
+            fresh.replace(self.file)
+
+
+def run_all(options: argparse.Namespace, book: Book) -> None:
+    """Run what the book does not hold yet."""
+    for which in options.sets:
+        for pair in SETS[which](options.data / which)[: options.pairs]:
+            todo = {name: key for name, key in _keys(options, which, pair) if not book.holds(key)}
+            if not todo:
+                continue
+            with TemporaryDirectory() as folder:
+                job = replace(prepare(pair, Path(folder)), device=options.device, threads=options.threads)
+                for name, key in todo.items():
+                    book.add(key | _about(name) | run_in_folder(name, pair, job, options))
+
+
+def _keys(options: argparse.Namespace, which: str, pair: Pair) -> Iterator[tuple[str, Row]]:
+    masks = bool(pair.fixed_mask and pair.moving_mask and not options.no_masks)
+    for name in options.tools:
+        how = {"masks": masks, "device": options.device, "threads": options.threads}
+        yield name, {"set": which, "pair": pair.name, "tool": name} | how
+
+
+def _about(name: str) -> Row:
+    tool = TOOLS[name]
+    about = {"package": tool.package, "version": version(tool.package), "settings": tool.settings}
+    return about | {"date": str(date.today()), "machine": describe_machine()}
+
+
+def run_in_folder(name: str, pair: Pair, job: Job, options: argparse.Namespace) -> Row:
+    """Run a tool in a folder of its own."""
+    masks = {"fixed_mask": None, "moving_mask": None} if options.no_masks else {}
+    with TemporaryDirectory() as folder:
+        return run_apart(name, pair, replace(job, folder=Path(folder), **masks), options.limit)
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Return one line for each set and tool, as Markdown."""
+    lines = ["| set | tool | pairs | " + " | ".join(_COLUMNS) + " | each pair |", "|---" * (len(_COLUMNS) + 4) + "|"]
+    for which, tool, masks in dict.fromkeys((row["set"], row["tool"], row["masks"]) for row in rows):
+        own = [row for row in rows if (row["set"], row["tool"], row["masks"]) == (which, tool, masks)]
+        good = [row for row in own if "failed" not in row]
+        cells = [_cell(good, key, show) for key, show in _COLUMNS.values()]
+        name = f"{which}, masks" if masks else which
+        lines.append(f"| {name} | {tool} | {len(good)} | " + " | ".join([*cells, _each(own)]) + " |")
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Run all and print the table."""
+def _cell(rows: Sequence[Row], key: str, show: Any) -> str:
+    values = [row[key] for row in rows if key in row]
+    return show(values) if values else ""
+
+
+def _each(rows: Sequence[Row]) -> str:
+    """Return the main figure of every pair, or why there is none."""
+    told = []
+    for row in rows:
+        told += [format(row[key], how) for key, how in _EACH if key in row] or [row.get("failed", "")]
+    return ", ".join(dict.fromkeys(told) if all("failed" in row for row in rows) else told)
+
+
+def circumstances(rows: Sequence[Row]) -> str:
+    """Return when, where, with what and how the runs were made, as Markdown."""
+    days = sorted({row["date"] for row in rows})
+    how = sorted({f"{row['threads']} threads, {row['device']}" for row in rows})
+    lines = [f"Made {' to '.join(dict.fromkeys((days[0], days[-1])))} on {'; '.join(_unique(rows, 'machine'))};"]
+    lines += [f"{'; '.join(how)}. Quality: median over the pairs (mean); folds, memory: the largest; time: median.", ""]
+    for tool in _unique(rows, "tool"):
+        row = next(row for row in reversed(rows) if row["tool"] == tool)
+        lines.append(f"* {tool}: {row['package']} {row['version']}; {row['settings']}.")
+    return "\n".join(lines)
+
+
+def _unique(rows: Sequence[Row], key: str) -> list[str]:
+    return list(dict.fromkeys(row[key] for row in rows))
+
+
+def parse() -> argparse.Namespace:
+    """Return the options."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", nargs="?", default=os.environ.get("TORCHDEFORM_DATA", "../shared/data"), type=Path)
     parser.add_argument("--sets", nargs="+", default=list(SETS), choices=list(SETS))
     parser.add_argument("--tools", nargs="+", default=list(TOOLS), choices=list(TOOLS))
-    parser.add_argument("--json", type=Path, help="file for the figures of every run")
-    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    parser.add_argument("--pairs", type=int, help="at most so many of each set")
+    parser.add_argument("--json", type=Path, help="file of all runs; what it holds is not run again")
+    parser.add_argument("--again", nargs="+", default=[], choices=list(TOOLS), help="run these again all the same")
+    parser.add_argument("--retry", action="store_true", help="run again what failed")
+    parser.add_argument("--print", action="store_true", help="only print the table of what the file holds")
+    parser.add_argument("--no-masks", action="store_true", help="keep masks to ourselves")
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="for the tools that can choose")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--limit", type=float, default=3600, help="seconds a run may take")
+    parser.add_argument("--one", nargs=2, type=Path, help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Run all and print the table."""
+    options = parse()
     if options.one:
-        name, files = options.one[0], json.loads(options.one[1])
-        print(json.dumps(run_one(name, Pair(files.pop("name"), **{k: Path(v) for k, v in files.items()}))))
+        order, answer = options.one
+        figures = run_here(json.loads(order.read_text(encoding="utf-8")))
+        answer.write_text(json.dumps(figures), encoding="utf-8")
         return
-    rows = []
-    for which in options.sets:
-        for pair in SETS[which](options.data / which):
-            for tool in options.tools:
-                rows.append({"set": which, "tool": tool, "pair": pair.name} | run_apart(tool, pair))
-                print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
-                if options.json:
-                    options.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
-    print(table(rows))
+    book = Book(options.json)
+    book.drop(options.again)
+    if options.retry:
+        book.rows = [row for row in book.rows if "failed" not in row]
+    if not options.print:
+        run_all(options, book)
+    command = shlex.join(["python", *sys.argv])
+    print(f"`{command}`\n\n{circumstances(book.rows)}\n\n{table(book.rows)}" if book.rows else "nothing was run")
 
 
 if __name__ == "__main__":

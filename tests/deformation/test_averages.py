@@ -121,6 +121,18 @@ STILL = torch.zeros(1, 2, 4, 5)
 FOLDED = SMALL.points() * torch.tensor([-3.0, 0.0]).view(1, 2, 1, 1)
 
 
+def test_small_determinants_may_be_lifted():
+    grid = Grid((17, 17))
+    u = wavy(grid, 5.0)
+    assert float(jacobian_determinant(u, grid).min()) < 0
+    with pytest.raises(InputError, match="folds"):
+        average_maps([u], grid)
+    average = average_maps([u, torch.zeros_like(u)], grid, least=0.1)
+    assert bool(average.value.isfinite().all())
+    mild = wavy(grid)
+    assert torch.equal(average_maps([mild], grid, least=0.1).value, average_maps([mild], grid).value)
+
+
 @pytest.mark.parametrize(
     ("maps", "weights", "message"),
     [

@@ -353,6 +353,17 @@ def test_exponential_is_the_flow_of_a_move():
     torch.testing.assert_close(map_, homogeneous(turn(2, math.degrees(0.3)), torch.zeros(2, dtype=torch.float64)))
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_settings_left_open_go_by_the_number_of_axes(dim):
+    window, nodes = {2: (7, 20_000), 3: (5, 150_000)}[dim]
+    open_, said = AlignmentSettings(), AlignmentSettings(window=9, nodes=5000)
+    assert (open_.window_in(dim), open_.nodes_in(dim)) == (window, nodes)
+    assert (said.window_in(dim), said.nodes_in(dim)) == (9, 5000)
+    fixed, moving = make_pair(make_true(turn(dim, 10)))
+    first, second = (align(fixed, moving, settings=s) for s in (open_, AlignmentSettings(window=window, nodes=nodes)))
+    assert torch.equal(first.affine.matrix, second.affine.matrix)
+
+
 FIXED, MOVING = make_pair(make_true(turn(2, 5)))
 SOLID = picture(empty((16, 16, 16), (4.0, 4.0, 4.0)))
 

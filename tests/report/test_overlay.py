@@ -9,7 +9,8 @@ import torch
 from torchdeform.grid import Grid
 from torchdeform.image import Image
 from torchdeform.io import read_image
-from torchdeform.report.overlay import _COLOURS, _cuts, write_overlay
+from torchdeform.report.drawing import BLUE, ORANGE
+from torchdeform.report.overlay import _cuts, write_overlay
 
 
 def half(dim: int, low: bool, **how) -> Image:
@@ -65,6 +66,6 @@ def test_it_is_the_same_every_time(tmp_path):
 
 def test_the_colours_are_told_apart_by_everybody():
     """They add up to white and differ most in blue against red, which no common colour blindness mixes up."""
-    blue, orange = (np.array(colour) for colour in _COLOURS)
+    blue, orange = (np.array(colour) for colour in (BLUE, ORANGE))
     np.testing.assert_allclose(blue + orange, 1.0)
     assert blue[2] - orange[2] == orange[0] - blue[0] == 1.0

@@ -1,12 +1,13 @@
 """``check``: what two images are, what looks wrong with them, and a picture of where they lie."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from torchdeform.check import ERROR, is_oblique, orientation, preflight
-from torchdeform.commands.options import FixedMask, MovingMask
+from torchdeform.check import ERROR, Finding, is_oblique, orientation, preflight
+from torchdeform.commands.options import FixedMask, Json, MovingMask, among, print_json
 from torchdeform.errors import InputError, require_choice
 from torchdeform.image import Image
 from torchdeform.io import read_image
@@ -19,9 +20,12 @@ Fixed = Annotated[
 ]
 Moving = Annotated[Path, typer.Argument(metavar="MOVING", help="Image that shall be warped onto it.")]
 Picture = Annotated[
-    Path | None, typer.Option("--out", metavar="PICTURE.png", show_default="none", help="Write an overlay picture.")
+    Path | None, typer.Option("--out", metavar="PICTURE.png", show_default=False, help="Write an overlay picture.")
 ]
-Align = Annotated[str, typer.Option(metavar="KIND", help=f"Alignment that shall come first: {', '.join(ALIGNMENTS)}.")]
+Align = Annotated[
+    str,
+    typer.Option(metavar="KIND", help=f"{', '.join(ALIGNMENTS)}: shall come first.", autocompletion=among(ALIGNMENTS)),
+]
 
 
 def check(
@@ -31,11 +35,11 @@ def check(
     moving_mask: MovingMask = None,
     align: Align = "affine",
     out: Picture = None,
+    json: Json = False,
 ) -> None:
     """Say what FIXED and MOVING are and what looks wrong with them, before they are registered. Nothing is moved.
 
     Orientations name where x, y and z point to: LPS is left, posterior, superior. Exit code 2 if there is an error.
-    Example: torchdeform check fixed.nii.gz moving.nii.gz --out overlay.png
     """
     require_choice(align, ALIGNMENTS, "--align")
     if out is not None and suffix(out) != ".png":
@@ -43,15 +47,26 @@ def check(
     images = read_image(fixed), read_image(moving)
     masks = [None if path is None else read_image(path) for path in (fixed_mask, moving_mask)]
     report = preflight(*images, fixed_mask=masks[0], moving_mask=masks[1], aligned=align != "none")
-    typer.echo(side_by_side(*images))
-    for finding in report.findings:
-        typer.echo(f"{finding.severity}: {finding.text}")
-    if not report.findings:
-        typer.echo("nothing looks wrong")
-    if out is not None:
-        _draw(out, *images)
+    drawn = _draw(out, *images) if out is not None else None
+    (_tell_program if json else _tell_person)(images, report.findings, drawn)
     if report.of(ERROR):
         raise typer.Exit(2)
+
+
+def _tell_person(images: tuple[Image, Image], findings: Sequence[Finding], picture: Path | None) -> None:
+    typer.echo(side_by_side(*images))
+    for finding in findings:
+        typer.echo(f"{finding.severity}: {finding.text}")
+    if not findings:
+        typer.echo("nothing looks wrong")
+    if picture is not None:
+        typer.echo(f"picture: {picture}")
+
+
+def _tell_program(images: tuple[Image, Image], findings: Sequence[Finding], picture: Path | None) -> None:
+    properties = {side: _properties(image) for side, image in zip(("fixed", "moving"), images, strict=True)}
+    found = [{"severity": finding.severity, "text": finding.text} for finding in findings]
+    print_json({**properties, "findings": found, "picture": picture})
 
 
 def side_by_side(fixed: Image, moving: Image) -> str:
@@ -79,9 +94,10 @@ def _properties(image: Image) -> dict[str, str]:
     }
 
 
-def _draw(out: Path, fixed: Image, moving: Image) -> None:
+def _draw(out: Path, fixed: Image, moving: Image) -> Path | None:
+    """Write the overlay and return where it is; None for a picture and a volume, which do not lie on each other."""
     if fixed.grid.dim != moving.grid.dim:
-        return
+        return None
     with staged(out.parent) as folder:
         write_overlay(folder / out.name, fixed, moving)
-    typer.echo(f"picture: {out}")
+    return out

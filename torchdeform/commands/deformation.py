@@ -6,7 +6,7 @@ from typing import Annotated, Any, cast, get_args
 
 import typer
 
-from torchdeform.commands.options import Device, Out, Quiet, table
+from torchdeform.commands.options import Device, Json, Out, Quiet, among, print_json, table
 from torchdeform.deform import (
     GridSettings,
     MonitorName,
@@ -24,7 +24,9 @@ ImageFile = Annotated[Path, typer.Argument(metavar="IMAGE", help="Image, 2D or 3
 Monitor = Annotated[
     str,
     typer.Option(
-        metavar="NAME", help=f"Where cells shall be small: {', '.join(get_args(MonitorName))} (IMAGE holds f itself)."
+        metavar="NAME",
+        help=f"Where cells shall be small: {', '.join(get_args(MonitorName))} (IMAGE holds f itself).",
+        autocompletion=among(get_args(MonitorName)),
     ),
 ]
 FMin = Annotated[float, typer.Option("--f-min", metavar="F", help="Size of the smallest cells, relative to --f-max.")]
@@ -33,21 +35,26 @@ Smoothing = Annotated[
     float | None,
     typer.Option(metavar="MM", show_default="2 voxels; simulate: 1", help="Standard deviation of the smoothing."),
 ]
-Velocity = Annotated[str, typer.Option(metavar="NAME", help=f"{', '.join(get_args(VelocityName))}.")]
+Velocity = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME", help=f"{', '.join(get_args(VelocityName))}.", autocompletion=among(get_args(VelocityName))
+    ),
+]
 DisplacementFile = Annotated[
     Path, typer.Argument(metavar="DISPLACEMENT", help="ITK displacement field, such as displacement.nii.gz.")
 ]
 Order = Annotated[int, typer.Option(metavar="N", help="Order of the finite differences, 2 or 4.")]
 Refine = Annotated[bool, typer.Option("--refine", metavar="", help="Correct the map to solver precision.")]
 Steps = Annotated[
-    int | None, typer.Option(metavar="N", show_default="none", help="Write N time steps from the identity to the map.")
+    int | None, typer.Option(metavar="N", show_default=False, help="Write N time steps from the identity to the map.")
 ]
 Labels = Annotated[Path, typer.Option(metavar="FILE", help="Label image on the grid of IMAGE.")]
 Volumes = Annotated[
     list[str], typer.Option("--volume", metavar="LABEL=FACTOR", help="New volume over old; can be repeated.")
 ]
 RigidMask = Annotated[
-    Path | None, typer.Option(metavar="FILE", show_default="none", help="Mask of what must not move (not 0 there).")
+    Path | None, typer.Option(metavar="FILE", show_default=False, help="Mask of what must not move (not 0 there).")
 ]
 
 
@@ -60,18 +67,18 @@ def adapt_grid(
     velocity: Velocity = "div_curl",
     out: Out = None,
     device: Device = "auto",
+    json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Adapt a regular grid to IMAGE: cells become small where its monitor is, and none folds.
 
     Writes displacement.nii.gz (where each node goes), monitor.nii.gz, grid.png and result.json.
-    Example: torchdeform grid brain.nii.gz --monitor gradient --f-min 0.1
     """
     settings = GridSettings(cast(MonitorName, monitor), f_min, f_max, smoothing, cast(VelocityName, velocity))
     folder = out or Path(f"{stem(image)}-grid")
     record = adapt_grid_to_file(image, folder, settings, choose_device(device))
     _tell(
-        quiet,
+        (json, quiet),
         folder,
         record,
         {"determinant / monitor": f"off by {_number(record, 'determinant_error_mean'):.2g} on average"},
@@ -85,17 +92,17 @@ def reconstruct(
     steps: Steps = None,
     out: Out = None,
     device: Device = "auto",
+    json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Reconstruct the map of DISPLACEMENT from its divergence, its curl and its boundary values.
 
     Writes displacement.nii.gz, the time steps, grids.png and result.json.
-    Example: torchdeform reconstruct results/displacement.nii.gz --steps 10
     """
     folder = out or Path(f"{stem(displacement)}-reconstructed")
     record = reconstruct_file(displacement, folder, order, refine, steps, choose_device(device))
     distance = f"{_number(record, 'distance_max'):.3g} at most, {_number(record, 'distance_mean'):.3g} on average"
-    _tell(quiet, folder, record, {"distance to the given map": distance})
+    _tell((json, quiet), folder, record, {"distance to the given map": distance})
 
 
 def simulate(
@@ -105,19 +112,19 @@ def simulate(
     rigid_mask: RigidMask = None,
     smoothing: Smoothing = None,
     out: Out = None,
+    json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Let labelled regions of IMAGE grow or shrink by given factors, by a smooth map that does not fold.
 
     Writes simulated.*, labels.*, displacement.nii.gz, transform.h5 (points after the change -> points of IMAGE, as a
     resampler needs it), inverse.h5 (points of IMAGE -> points after the change), grid.png and result.json.
-    Example: torchdeform simulate brain.nii.gz --labels labels.nii.gz --volume 17=0.95 --volume 53=0.95
     """
     folder = out or Path(f"{stem(image)}-simulated")
     record = simulate_file(image, labels, _factors(volume), folder, rigid_mask, smoothing)
     volumes = cast("list[dict[str, Any]]", record["volumes"])
     reached = ", ".join(f"{v['label']}: {v['reached']:.4f} (asked {v['asked']:g})" for v in volumes)
-    _tell(quiet, folder, record, {"volumes": reached})
+    _tell((json, quiet), folder, record, {"volumes": reached})
 
 
 def _factors(texts: list[str]) -> dict[int, float]:
@@ -140,9 +147,12 @@ def _number(record: Record, name: str) -> float:
     return float(cast(float, record[name]))
 
 
-def _tell(quiet: bool, folder: Path, record: Record, lines: dict[str, str]) -> None:
-    """Print what a person wants to know of the result."""
-    if quiet:
+def _tell(how: tuple[bool, bool], folder: Path, record: Record, lines: dict[str, str]) -> None:
+    """Print what a program or a person wants to know of the result; ``how``: json, quiet."""
+    json, quiet = how
+    if json:
+        print_json({**record, "out": str(folder)})
+    if json or quiet:
         return
     low, high = _number(record, "determinant_min"), _number(record, "determinant_max")
     common = {"folds": f"{record['folds']}, determinant {low:.3g} to {high:.3g}"}

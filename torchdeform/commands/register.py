@@ -8,35 +8,51 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from torchdeform.commands.options import Device, FixedMask, MovingMask, Out, Quiet, Version, table
+from torchdeform.commands.options import (
+    Device,
+    FixedMask,
+    Json,
+    MovingMask,
+    Out,
+    Quiet,
+    Version,
+    among,
+    print_json,
+    table,
+)
 from torchdeform.config import load_settings, parse_override, preset_names
 from torchdeform.io.files import stem
 from torchdeform.memory import parse_size
-from torchdeform.pair import Outcome, PairFiles, register_files
+from torchdeform.pair import REPORT, Outcome, PairFiles, register_files
 from torchdeform.registration.result import Progress as Step
 from torchdeform.registration.settings import ALIGNMENTS, similarity_weights
 
 Fixed = Annotated[
     Path,
-    typer.Argument(metavar="FIXED", help="Image that stays: PNG, TIFF, NIfTI, MetaImage, NRRD, a DICOM folder ..."),
+    typer.Argument(metavar="FIXED", help="Image that stays: PNG, TIFF, NIfTI, NRRD, a DICOM folder ..."),
 ]
 Moving = Annotated[Path, typer.Argument(metavar="MOVING", help="Image that is warped onto it.")]
 FixedPoints = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", show_default="none", help="Landmarks (csv, elastix txt, Slicer), measured ..."),
+    typer.Option(metavar="FILE", show_default=False, help="Landmarks (csv, elastix txt, Slicer), measured ..."),
 ]
 MovingPoints = Annotated[
-    Path | None, typer.Option(metavar="FILE", show_default="none", help="... and the same landmarks in MOVING.")
+    Path | None, typer.Option(metavar="FILE", show_default=False, help="... and the same landmarks in MOVING.")
 ]
 FixedLabels = Annotated[
-    Path | None, typer.Option(metavar="FILE", show_default="none", help="Regions, whose overlap is measured ...")
+    Path | None, typer.Option(metavar="FILE", show_default=False, help="Regions, whose overlap is measured ...")
 ]
 MovingLabels = Annotated[
-    Path | None, typer.Option(metavar="FILE", show_default="none", help="... and the same regions of MOVING.")
+    Path | None, typer.Option(metavar="FILE", show_default=False, help="... and the same regions of MOVING.")
 ]
 Align = Annotated[
     str | None,
-    typer.Option(metavar="KIND", show_default="affine", help=f"Alignment that comes first: {', '.join(ALIGNMENTS)}."),
+    typer.Option(
+        metavar="KIND",
+        show_default=False,
+        help=f"First: {', '.join(ALIGNMENTS)} (usual).",
+        autocompletion=among(ALIGNMENTS),
+    ),
 ]
 PointsWeight = Annotated[
     float | None, typer.Option(metavar="W", show_default="0", help="Let the landmarks pull, with this weight.")
@@ -45,9 +61,17 @@ Symmetric = Annotated[
     bool, typer.Option("--symmetric", metavar="", help="Prefer neither image: swapping them inverts the map.")
 ]
 Memory = Annotated[
-    str | None, typer.Option(metavar="SIZE", show_default="what is free", help="Memory to take at most, such as 4GB.")
+    str | None, typer.Option(metavar="SIZE", show_default="what is free", help="Take at most this, such as 4GB.")
 ]
-Preset = Annotated[str, typer.Option(metavar="NAME", help=f"Settings to start from: {', '.join(preset_names())}.")]
+Preset = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        show_default=False,
+        help=f"Settings to start from: {', '.join(preset_names())}.",
+        autocompletion=preset_names,
+    ),
+]
 Config = Annotated[
     Path | None, typer.Option(metavar="FILE", help="YAML file with settings that differ from the preset.")
 ]
@@ -74,13 +98,15 @@ def register(
     assignments: Assignments = None,
     memory: Memory = None,
     device: Device = "auto",
+    json: Json = False,
     quiet: Quiet = False,
     version: Version = False,
 ) -> None:
     """Warp MOVING onto FIXED: an alignment, then a map that does not fold.
 
-    Writes warped.*, displacement.nii.gz, transform.h5, inverse.h5, result.json and overview.png, all or none.
-    transform.h5 takes points from FIXED to MOVING and brings the image MOVING onto FIXED; inverse.h5 the other way.
+    Writes report.html (open it: did it work?), warped.*, transform.h5, inverse.h5, displacement.nii.gz, overview.png
+    and result.json, all or none. transform.h5 takes points from FIXED to MOVING and brings the image MOVING onto FIXED;
+    inverse.h5 goes the other way.
     """
     shortcuts = {"align": align, "points_weight": points_weight, "symmetric": symmetric or None}
     overrides = {key: value for key, value in shortcuts.items() if value is not None}
@@ -99,7 +125,9 @@ def register(
     limit = None if memory is None else parse_size(memory)
     with _Bar(quiet) as bar:
         outcome = register_files(files, settings, device=device, memory=limit, callback=bar.show)
-    if not quiet:
+    if json:
+        print_json({**outcome.record, "out": str(outcome.folder)})
+    elif not quiet:
         for warning in outcome.warnings:
             typer.echo(f"warning: {warning}", err=True)
         typer.echo(summary(outcome))
@@ -115,6 +143,7 @@ def summary(outcome: Outcome) -> str:
         **_measured(r),
         "seconds": f"{sum(outcome.seconds.values()):.1f} on {r['device']}",
         "results": f"{outcome.folder}{os.sep} ({', '.join(outcome.files)})",
+        "look at": str(outcome.folder / REPORT),
     }
     return table(lines)
 

@@ -1,5 +1,6 @@
 """``apply``, ``points``, ``invert``, ``compose``, ``jacobian``: transforms at the shell."""
 
+import math
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
@@ -8,10 +9,10 @@ from typing import Annotated
 import torch
 import typer
 
-from torchdeform.commands.options import Quiet
+from torchdeform.commands.options import Json, Quiet, among, print_json
 from torchdeform.errors import InputError, require_choice
 from torchdeform.image import Image
-from torchdeform.interpolation import MODES
+from torchdeform.interpolation import COPYING, MODES
 from torchdeform.io.files import require_writable, suffix
 from torchdeform.io.images import FORMATS, read_image, write_image
 from torchdeform.io.labels import read_labels, write_labels
@@ -44,7 +45,7 @@ Reference = Annotated[
 ]
 Counted = Annotated[
     Path | None,
-    typer.Option(metavar="IMAGE", show_default="none", help="Image whose voxels POINTS counts, if it does."),
+    typer.Option(metavar="IMAGE", show_default=False, help="Image whose voxels POINTS counts, if it does."),
 ]
 FieldGrid = Annotated[
     Path | None,
@@ -55,7 +56,12 @@ FieldGrid = Annotated[
     ),
 ]
 Interpolation = Annotated[
-    str, typer.Option(metavar="NAME", help=f"{', '.join(MODES)}; nearest for labels, whose type is kept.")
+    str,
+    typer.Option(
+        metavar="NAME",
+        help=f"{', '.join(MODES)}; label or nearest keep values and their type.",
+        autocompletion=among(MODES),
+    ),
 ]
 Inverse = Annotated[bool, typer.Option("--inverse", metavar="", help="Go the other way, by the inverse of TRANSFORM.")]
 Outside = Annotated[float, typer.Option(metavar="VALUE", help="Value where MOVING does not reach.")]
@@ -74,12 +80,10 @@ def apply(
 
     Images go from moving to fixed with the same transform that takes points from fixed to moving. With --inverse an
     image of the fixed space goes to the moving space.
-    Example: torchdeform apply transform.h5 labels.nii.gz --reference fixed.nii.gz --out warped.nii.gz
-    --interpolation nearest
     """
     require_choice(interpolation, MODES, "--interpolation")
     _prepare_image(out, transform, moving, reference)
-    labels = interpolation == "nearest"
+    labels = interpolation in COPYING
     chain = _read(transform, inverse)
     place = _place(chain, reference, transform)
     image = read_labels(moving) if labels else read_image(moving)
@@ -98,7 +102,6 @@ def points(
 
     Points go from fixed to moving with the same transform that brings the moving image to the fixed one. With --inverse
     points of the moving image go to the fixed image.
-    Example: torchdeform points transform.h5 landmarks.csv --out landmarks_in_moving.csv
     """
     require_points_file(out)
     _prepare(out, transform, points, reference)
@@ -108,20 +111,25 @@ def points(
     write_points(replace(given, positions=chain.points(given.positions)), out)
 
 
-def invert(transform: TransformFile, out: OutFile, reference: FieldGrid = None, quiet: Quiet = False) -> None:
+def invert(
+    transform: TransformFile, out: OutFile, reference: FieldGrid = None, json: Json = False, quiet: Quiet = False
+) -> None:
     """Write the inverse of TRANSFORM, which takes points from moving to fixed and images from fixed to moving.
 
     Affine maps are inverted exactly, displacement fields on their own grid. Prints how far a point comes to lie from
     where it started after TRANSFORM and its inverse.
-    Example: torchdeform invert transform.h5 --out inverse.h5
     """
     require_transform_file(out)
     _prepare(out, transform, reference)
     chain = _read(transform)
     inverse = _on_grid(chain.inverse(), reference)
     write_transform(inverse, out)
-    if not quiet and (place := chain.reference) is not None:
-        mean, largest = _round_trip(chain, place)
+    if quiet and not json:
+        return
+    mean, largest = (math.nan, math.nan) if chain.reference is None else _round_trip(chain, chain.reference)
+    if json:
+        print_json({"out": out, "inverse_error_mean_mm": mean, "inverse_error_max_mm": largest})
+    elif chain.reference is not None:
         typer.echo(f"inverse error  {mean:.2g} mm on average, {largest:.2g} at most")
 
 
@@ -130,7 +138,6 @@ def compose(transforms: TransformFiles, out: OutFile, reference: FieldGrid = Non
 
     The result takes points of the fixed space of FIRST to the moving space of the last, and brings images back. This
     is the order in which ANTs lists its transforms.
-    Example: torchdeform compose 1Warp.nii.gz 0GenericAffine.mat --out transform.h5
     """
     require_transform_file(out)
     _prepare(out, *transforms, reference)
@@ -139,21 +146,27 @@ def compose(transforms: TransformFiles, out: OutFile, reference: FieldGrid = Non
     write_transform(_on_grid(reduce(Transform.then, map(_read, transforms)), reference), out)
 
 
-def jacobian(transform: TransformFile, out: OutFile, reference: Reference = None, quiet: Quiet = False) -> None:
+def jacobian(
+    transform: TransformFile, out: OutFile, reference: Reference = None, json: Json = False, quiet: Quiet = False
+) -> None:
     """Write the Jacobian determinant of TRANSFORM on the grid of the fixed image: moving volume over fixed volume.
 
     Points go from fixed to moving: above 1 a piece of the fixed image is larger in the moving image, below 1 smaller,
     0 or less is a fold.
-    Example: torchdeform jacobian transform.h5 --reference fixed.nii.gz --out determinant.nii.gz
     """
     _prepare_image(out, transform, reference)
     chain = _read(transform)
     image = chain.jacobian_determinant(_place(chain, reference, transform))
     write_image(image, out)
-    if not quiet:
-        low, high, mean = (float(f(image.data)) for f in (torch.amin, torch.amax, torch.mean))
+    low, high, mean = (float(f(image.data)) for f in (torch.amin, torch.amax, torch.mean))
+    folds = int((~(image.data > 0)).sum())
+    if json:
+        print_json(
+            {"out": out, "determinant_min": low, "determinant_max": high, "determinant_mean": mean, "folds": folds}
+        )
+    elif not quiet:
         typer.echo(f"determinant  {low:.3g} to {high:.3g}, {mean:.3g} on average")
-        typer.echo(f"folds        {int((~(image.data > 0)).sum())}")
+        typer.echo(f"folds        {folds}")
 
 
 VERBS = {"apply": apply, "points": points, "invert": invert, "compose": compose, "jacobian": jacobian}

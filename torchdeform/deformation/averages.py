@@ -19,6 +19,7 @@ def average_maps(
     weights: Sequence[float] | None = None,
     *,
     order: int = 2,
+    least: float = 0.0,
     settings: NewtonSettings = _DEFAULT,
 ) -> PrescribedSolution:
     """Return u of the map with det ∇φ = Π (det ∇φ_i)^w_i and curl φ = Σ w_i curl φ_i, and boundary values Σ w_i u_i.
@@ -29,6 +30,7 @@ def average_maps(
         grid: the grid of all.
         weights: w_i, not negative; divided by their sum; equal by default.
         order: order of the finite differences, 2 or 4.
+        least: determinants below this count as this; 0 refuses maps with a determinant that is not positive.
         settings: tolerance and steps of `from_jacobian_and_curl`.
 
     Returns:
@@ -47,6 +49,7 @@ def average_maps(
     log_det, rotation, mean = 0.0, 0.0, 0.0
     for index, (u, share) in enumerate(zip(displacements, shares, strict=True)):
         det = jacobian_determinant(u, grid, order)
+        det = det.clamp(min=least) if least > 0 else det
         if not bool((det > 0).all()):
             raise InputError(f"average_maps: map {index} folds, its determinant falls to {float(det.min()):g}")
         log_det, rotation, mean = log_det + share * det.log(), rotation + share * curl(u, grid, order), mean + share * u

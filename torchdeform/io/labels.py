@@ -15,16 +15,25 @@ from torchdeform.io.images import FORMATS, read_image, write_image
 
 # Types with values that float32, in which images are read, does not tell apart.
 _WIDE = ("int32", "uint32", "int64", "uint64", "float64")
+_COLOURED = (3, 4)  # channels
 _VOLUMES = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd", ".nhdr")
 
 
 def read_labels(path: str | os.PathLike[str]) -> Image:
     """Read a label image: like `read_image`, but volumes in float64 where float32 would merge labels above 2²⁴.
 
+    Args:
+        path: the file, any format that `read_image` reads.
+
+    Returns:
+        The image; a picture whose three channels are equal, as drawing programs save grey ones, has one.
+
     Raises:
         InputError: as `read_image`.
     """
     image = read_image(path)
+    if image.data.shape[1] == 3 and bool((image.data == image.data[:, :1]).all()):
+        image = replace(image, data=image.data[:, :1].contiguous())
     if image.pixel_type not in _WIDE or suffix(Path(path)) not in _VOLUMES:
         return image
     import SimpleITK as sitk
@@ -35,6 +44,10 @@ def read_labels(path: str | os.PathLike[str]) -> Image:
 
 def write_labels(image: Image, path: str | os.PathLike[str]) -> None:
     """Write a label image in its own ``pixel_type``, volumes too; whole or not at all.
+
+    Args:
+        image: whole numbers, with their place in the world.
+        path: the file, any format that `write_image` writes.
 
     Raises:
         InputError: a format that cannot hold that type, or a place that cannot be written.
@@ -48,3 +61,10 @@ def write_labels(image: Image, path: str | os.PathLike[str]) -> None:
     with staged(file.parent) as folder:
         itk.save(itk.from_values(values, image), folder / file.name)
     return None
+
+
+def _grey(image: Image) -> Image:
+    """Return the one channel that red, green and blue have in common, or the image as it is."""
+    colours = image.data[:, :3]
+    same = image.data.shape[1] in _COLOURED and bool((colours == colours[:, :1]).all())
+    return replace(image, data=image.data[:, :1]) if same else image

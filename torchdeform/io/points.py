@@ -109,6 +109,10 @@ def matched(fixed: Points, moving: Points) -> tuple[Tensor, Tensor, tuple[str, .
 def write_points(points: Points, path: _Path) -> None:
     """Write landmarks, world LPS mm, in the format that the file's ending tells; see `read_points`.
 
+    Args:
+        points: names and positions.
+        path: the file; replaced whole.
+
     Raises:
         InputError: an unknown ending, or a place that cannot be written.
     """

@@ -36,7 +36,18 @@ def to_voxels(u: Tensor, grid: Grid) -> Tensor:
 
 
 def from_voxels(voxels: Tensor, grid: Grid) -> Tensor:
-    """Return the displacement in units of spacing of one in voxels; the inverse of `to_voxels`, arguments likewise."""
+    """Return the displacement in units of spacing of one in voxels; the inverse of `to_voxels`.
+
+    Args:
+        voxels: displacement ``(B, D, *S)`` in voxels, component k along array axis k.
+        grid: its grid.
+
+    Returns:
+        u ``(B, D, *S)`` in units of spacing.
+
+    Raises:
+        InputError: shape.
+    """
     grid.check_vector(voxels, "from_voxels: voxels")
     return voxels * grid.along(grid.spacing, voxels)
 
@@ -67,6 +78,9 @@ def from_grid_sample(positions: Tensor, grid: Grid, *, displacement: bool = Fals
         positions: ``(B, *S, D)``, components x, y, z.
         grid: the grid.
         displacement: what is given are displacements in that box.
+
+    Returns:
+        u ``(B, D, *S)`` in units of spacing.
 
     Raises:
         InputError: shape.
@@ -111,6 +125,9 @@ def from_itk(vectors: Tensor, grid: Grid, direction: Sequence[Sequence[float]] =
         vectors: ``(B, *S, D)`` in mm, components x, y, z of the world.
         grid: the grid.
         direction: as in `to_itk`.
+
+    Returns:
+        u ``(B, D, *S)`` in units of spacing.
 
     Raises:
         InputError: shape, or a direction of another size.

@@ -24,6 +24,11 @@ from torchdeform.warp import sample
 _COARSEST = 4096
 _FINER = 1.02
 
+# Nodes of the finest level and width of the LNCC window where nothing else is asked for. In 2D finer levels made the
+# map worse (brain slices, tissue sections): one part fits in every detail, and the rest, which bends, goes with it.
+_NODES = {2: 20_000, 3: 150_000}
+_WINDOW = {2: 7, 3: 5}
+
 # Voxels around a mask that belong to the picture.
 _MARGIN = 4
 
@@ -44,11 +49,13 @@ class AlignmentSettings:
 
     Args:
         similarity: name, or names with weights, as in `RegistrationSettings`. ``lncc`` alone is `DetailCorrelation`,
-            which also finds maps between many different contrasts; ``nmi`` is for those it does not.
-        window: width of the LNCC window in voxels of each level, odd.
+            which also finds maps between many different contrasts; ``nmi`` is for those it does not. ``mind`` suits
+            tissue sections that turn little.
+        window: width of the LNCC window in voxels of each level, odd; 7 in 2D and 5 in 3D when None.
         rotations: try rotations all around, and mirror images, at the coarsest level; otherwise only the files'
             geometry and the centres are starts, which finds rotations up to some 30°.
-        nodes: nodes of the finest level at most; more take longer and change little.
+        nodes: nodes of the finest level at most, 20 000 in 2D and 150 000 in 3D when None. More take longer, and are
+            better only where one affine map fits everything.
         min_overlap: share of the smaller image (or mask) that must lie in the other one.
         steps: evaluations of the similarity at most on each level.
 
@@ -57,22 +64,30 @@ class AlignmentSettings:
     """
 
     similarity: str | Mapping[str, float] = "lncc"
-    window: int = 5
+    window: int | None = None
     rotations: bool = True
-    nodes: int = 150_000
+    nodes: int | None = None
     min_overlap: float = 0.3
     steps: int = 40
 
     def __post_init__(self) -> None:
         similarity_weights(self.similarity)
-        if self.window < 3 or self.window % 2 == 0:
+        if self.window is not None and (self.window < 3 or self.window % 2 == 0):
             raise InputError(f"window must be an odd number of voxels, at least 3, got {self.window}")
         if not 0 < self.min_overlap <= 1:
             raise InputError(f"min_overlap must lie between 0 and 1, got {self.min_overlap}")
-        if self.nodes < _COARSEST:
+        if self.nodes is not None and self.nodes < _COARSEST:
             raise InputError(f"nodes must be at least {_COARSEST}, got {self.nodes}")
         if self.steps < 1:
             raise InputError(f"steps must be at least 1, got {self.steps}")
+
+    def window_in(self, dim: int) -> int:
+        """Return the width of the window for images of ``dim`` axes."""
+        return self.window or _WINDOW[dim]
+
+    def nodes_in(self, dim: int) -> int:
+        """Return the nodes of the finest level at most for images of ``dim`` axes."""
+        return self.nodes or _NODES[dim]
 
 
 @dataclass(frozen=True)
@@ -278,7 +293,7 @@ def _levels(fixed: Masked, moving: Masked, frame: Frame, settings: AlignmentSett
     ``size`` is how much larger things are in the moving image: voxels larger by as much blur both images alike.
     """
     voxel = min(fixed.image.grid.spacing)
-    while math.prod(coarse_grid(fixed.image.grid, voxel).shape) > settings.nodes:
+    while math.prod(coarse_grid(fixed.image.grid, voxel).shape) > settings.nodes_in(fixed.image.grid.dim):
         voxel *= _FINER
     levels = []
     while True:
@@ -296,7 +311,7 @@ def _level(fixed: Masked, moving: Masked, frame: Frame, settings: AlignmentSetti
 
     def make(image: Tensor, grid: Grid) -> Similarity:
         if similarity_weights(settings.similarity).keys() == {"lncc"}:
-            return DetailCorrelation(image, settings.window)
-        return make_similarity(settings.similarity, image, settings.window, grid=grid)
+            return DetailCorrelation(image, settings.window_in(grid.dim))
+        return make_similarity(settings.similarity, image, settings.window_in(grid.dim), grid=grid)
 
     return Level(compared(fixed), compared(moving), frame, make, settings.min_overlap)

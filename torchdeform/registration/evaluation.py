@@ -9,10 +9,10 @@ from torch import Tensor
 from torchdeform.errors import InputError
 from torchdeform.grid import Grid
 from torchdeform.image import Image, resample
+from torchdeform.interpolation import LABEL_MODE, interpolator
 from torchdeform.registration.guidance import Guidance
-from torchdeform.registration.placing import moved
-from torchdeform.transform import Affine
-from torchdeform.warp import sample, warp
+from torchdeform.transform import Affine, Transform
+from torchdeform.warp import sample
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,13 @@ class Evaluation:
         before: with both images where they are.
         aligned: after the affine map; None without one.
         after: after the affine map and the displacement.
+        label_interpolation: how the labels of the moving image were carried, a mode of `interpolator`; None without.
     """
 
     before: Measures
     aligned: Measures | None
     after: Measures
+    label_interpolation: str | None = None
 
 
 def evaluate_tensors(guidance: Guidance, u: Tensor, grid: Grid) -> Evaluation | None:
@@ -54,11 +56,11 @@ def evaluate_tensors(guidance: Guidance, u: Tensor, grid: Grid) -> Evaluation | 
         return None
 
     def at(w: Tensor) -> Measures:
-        regions = labels and (labels[0], warp(labels[1].to(w), w, grid, mode="nearest"))
+        regions = labels and (labels[0], _warped_labels(labels[1].to(w), w, grid))
         pairs = points and (points[0] + sample(w, points[0].to(w), grid), points[1])
         return _measures(regions, pairs, grid, labels)
 
-    return Evaluation(at(torch.zeros_like(u)), None, at(u))
+    return Evaluation(at(torch.zeros_like(u)), None, at(u), labels and LABEL_MODE)
 
 
 def evaluate_images(fixed: Image, guidance: Guidance, affine: Affine | None, u: Tensor) -> Evaluation | None:
@@ -83,7 +85,8 @@ def evaluate_images(fixed: Image, guidance: Guidance, affine: Affine | None, u: 
         return _measures(seen, pairs, fixed.grid, regions and (regions[0], regions[1].data))
 
     still = torch.zeros_like(u)
-    return Evaluation(at(None, still), None if affine is None else at(affine, still), at(affine, u))
+    aligned = None if affine is None else at(affine, still)
+    return Evaluation(at(None, still), aligned, at(affine, u), regions and LABEL_MODE)
 
 
 def carry_points(points: Tensor, fixed: Image, affine: Affine | None, u: Tensor) -> Tensor:
@@ -94,8 +97,16 @@ def carry_points(points: Tensor, fixed: Image, affine: Affine | None, u: Tensor)
 
 
 def _carried_labels(labels: Image, fixed: Image, affine: Affine | None, u: Tensor) -> Tensor:
-    seen = labels if affine is None else moved(labels, affine.inverse())
-    return resample(seen, fixed, u, mode="nearest")
+    return Transform.from_displacement(u, fixed, affine=affine).labels(labels, fixed).data
+
+
+def _warped_labels(labels: Tensor, u: Tensor, grid: Grid) -> Tensor:
+    """Return the labels ``(B or 1, 1, *S)`` of each item through its displacement, continued beyond the edge."""
+    items = labels.expand(len(u), *labels.shape[1:]).split(1)
+    points = (grid.points(dtype=torch.float64, device=u.device) + u).split(1)
+    return torch.cat(
+        [interpolator(i, grid, mode=LABEL_MODE, outside=None)(p) for i, p in zip(items, points, strict=True)]
+    )
 
 
 def _labels(guidance: Guidance) -> tuple[Tensor, Tensor] | None:
@@ -121,24 +132,27 @@ def _measures(regions: _Pair | None, pairs: _Pair | None, grid: Grid, original: 
     return Measures(labels, dice(*regions, labels), hausdorff(*regions, labels, grid), distances)
 
 
-def common_labels(fixed: Tensor, moving: Tensor) -> tuple[int, ...]:
+def common_labels(
+    fixed: Tensor, moving: Tensor, *, names: tuple[str, str] = ("fixed_labels", "moving_labels")
+) -> tuple[int, ...]:
     """Return the labels, other than 0, that both have.
 
     Args:
         fixed: ``(B, 1, *S)``, whole numbers of any type.
         moving: the same, of any shape.
+        names: what to call them in messages.
 
     Raises:
         InputError: numbers that are not whole, or none in common.
     """
     found = []
-    for name, field in (("fixed_labels", fixed), ("moving_labels", moving)):
+    for name, field in zip(names, (fixed, moving), strict=True):
         values = field.unique()
         if not bool((values == values.round()).all() if values.is_floating_point() else True):
             raise InputError(f"{name} must hold whole numbers; check that it is the right one")
         found.append({int(v) for v in values.tolist()} - {0})
     if not found[0] & found[1]:
-        raise InputError("fixed_labels and moving_labels have no label in common; check that they are the right ones")
+        raise InputError(f"{' and '.join(names)} have no label in common; check that they are the right ones")
     return tuple(sorted(found[0] & found[1]))
 
 

@@ -17,11 +17,12 @@ from torchdeform.grid import Grid
 from torchdeform.registration.comparison import Comparison, compare_from_fixed, compare_from_middle
 from torchdeform.registration.landmarks import Landmarks, Pull, make_landmarks
 from torchdeform.registration.metrics.base import column
-from torchdeform.registration.pyramid import prolong, pyramid_grids
+from torchdeform.registration.pyramid import prolong, pyramid_grids, thinned
 from torchdeform.registration.result import Callback, LevelRecord, Progress
 from torchdeform.registration.scene import Scene
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.steps import advance, keep, lowest_determinant, mended
+from torchdeform.registration.transfer import Transfer
 from torchdeform.stencil import derivative
 from torchdeform.warp import max_voxels
 
@@ -35,6 +36,10 @@ _LAST_STEP = 0.1
 # 291×216 took twice as long as with one.
 _NODES_PER_THREAD = 2**16
 
+# Levels whose images have more nodes than this carry the map on the coarser grid of `RegistrationSettings.map_spacing`.
+# Mouse brains (10^6 nodes) gain 0.003 Dice and half of the time by it; slices and hippocampi (7·10^4) would lose 0.01.
+_LARGE = 2**17
+
 # Weight of the divergence that opens up nearly folded places, against a force of 1 at its strongest.
 _RESISTANCE = 3.0
 
@@ -45,12 +50,13 @@ class _Level:
 
     Attributes:
         index: its number, 0 is the coarsest.
-        comparison: of the images.
+        comparison: of the images, on their grid.
         landmarks: pairs of points that pull, or None.
         metric: the least-squares operator.
         held: its weight w_0 of the velocity itself.
         controls: the form of the load: divergence and force.
         settings: the settings.
+        transfer: between the grid of the images and that of the map, None where they are one.
     """
 
     index: int
@@ -60,11 +66,12 @@ class _Level:
     held: float
     controls: Form
     settings: RegistrationSettings
+    transfer: Transfer | None = None
 
     @property
     def grid(self) -> Grid:
-        """The grid of the level."""
-        return self.comparison.grid
+        """The grid of the level's map."""
+        return self.metric.grid
 
     @property
     def sides(self) -> int:
@@ -93,9 +100,9 @@ def climb_levels(
     for index, grid in enumerate(grids):
         level = _make_level(index, len(grids) - 1 - index, scene.on(grid), settings)
         with threads_worth(len(u), grid):
-            u, record = _climb(level, mended(prolong(u, grid), grid), len(grids), callback)
+            u, record = _climb(level, mended(prolong(u, level.grid), level.grid), len(grids), callback)
         records.append(record)
-    return u, tuple(records)
+    return mended(prolong(u, scene.grid), scene.grid), tuple(records)
 
 
 @contextmanager
@@ -115,9 +122,14 @@ def metric_weights(grid: Grid, settings: RegistrationSettings, below: int) -> We
     return Weights(div=settings.weight_div, curl=settings.weight_curl, zero=held)
 
 
+def _map_grid(grid: Grid, settings: RegistrationSettings) -> Grid:
+    """Return the grid that carries the map of images on ``grid``."""
+    return thinned(grid, settings.map_spacing) if math.prod(grid.shape) > _LARGE else grid
+
+
 def _make_level(index: int, below: int, scene: Scene, settings: RegistrationSettings) -> _Level:
     """Return the level of a scene that is on the level's grid, with so many finer levels below it."""
-    grid, sides = scene.grid, 2 if settings.symmetric else 1
+    grid, sides = _map_grid(scene.grid, settings), 2 if settings.symmetric else 1
     compare = compare_from_middle if settings.symmetric else compare_from_fixed
     pulls = settings.points_weight > 0
     weights = metric_weights(grid, settings, below)
@@ -131,18 +143,19 @@ def _make_level(index: int, below: int, scene: Scene, settings: RegistrationSett
         held=float(weights.zero),
         controls=(divergence, *force),
         settings=settings,
+        transfer=Transfer(scene.grid, grid, scene.fixed) if grid != scene.grid else None,
     )
 
 
 def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> tuple[Tensor, LevelRecord]:
     """Climb one level; every pair ends at the best maps it met."""
     start, shortened, settings = perf_counter(), 0, level.settings
-    steps = settings.steps[level.index - levels]
+    steps = _steps(level, settings.steps[level.index - levels])
     best, values, tops = u, [], []
     top = u.new_full((len(u) // level.sides,), -torch.inf)
     active, lowest = torch.ones_like(top, dtype=torch.bool), lowest_determinant(u, level.grid)
     for step in range(steps + 1):
-        warped, value, gradient = level.comparison.look(u)
+        warped, value, gradient = level.comparison.look(level.transfer.up(u) if level.transfer else u)
         pull = level.landmarks.look(u) if level.landmarks else None
         goal = value if pull is None else value - settings.points_weight * pull.distance
         better = goal > top
@@ -150,7 +163,7 @@ def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> 
         values.append(value)
         tops.append(top)
         if callback:
-            callback(Progress(level.index, levels, step, steps, value, level.grid.shape))
+            callback(Progress(level.index, levels, step, steps, value, level.comparison.grid.shape))
         active &= ~_stalled(tops, settings.tolerance)
         if step == steps or not bool(active.any()):
             break
@@ -161,7 +174,12 @@ def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> 
         u, lowest, moved, short = advance((u, lowest), move, level.grid, settings.min_determinant, level.sides)
         active &= moved
         shortened += short
-    return best, LevelRecord(level.grid.shape, tuple(values), shortened, perf_counter() - start)
+    return best, LevelRecord(level.comparison.grid.shape, tuple(values), shortened, perf_counter() - start)
+
+
+def _steps(level: _Level, steps: int) -> int:
+    """Return the steps of a level: a coarser map has less to find, in as many times fewer steps."""
+    return steps if level.transfer is None else math.ceil(steps / level.settings.map_spacing)
 
 
 def _stalled(tops: list[Tensor], tolerance: float) -> Tensor:
@@ -179,8 +197,9 @@ def _velocity(level: _Level, warped: Tensor, gradient: Tensor, divergence: Tenso
     logarithm in 2D and 1/r in 3D, has a peak there. Two maps of a pair move against each other.
     """
     grid = level.grid
-    force = image_force(gradient, warped, grid)
-    points = None if pull is None else pull.load(grid) * (level.settings.points_weight * warped[0].numel())
+    force = image_force(gradient, warped, level.comparison.grid)
+    force = level.transfer.gather(force) if level.transfer else force
+    points = None if pull is None else pull.load(grid) * (level.settings.points_weight * math.prod(grid.shape))
     strongest = strongest_of(force) if points is None else strongest_of(force).maximum(strongest_of(points))
     scale = 1 / strongest.clamp(min=torch.finfo(force.dtype).tiny)
     load = assemble_load(level.controls, torch.cat([divergence, force * column(scale, force)], dim=1), grid)

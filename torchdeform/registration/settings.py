@@ -48,13 +48,15 @@ class RegistrationSettings:
         window: width of the LNCC window in voxels, odd.
         weight_div: price w_d of a change of volume in the metric; large keeps volumes.
         weight_curl: price w_c of a rotation.
-        length: range √(w_d / w_0) of the metric in voxels of each level; longer makes the velocity smoother. One
+        length: range √(w_d / w_0) of the metric in voxels of each level's map; longer makes the velocity smoother. One
             number, or one for each level, coarse to fine: the last is for the finest, the first for all not named.
         power: 1, or 2 for a smoother velocity, see `TransformSolver.solve`.
         steps: steps at most on each pyramid level, coarse to fine; its length is the number of levels (a level that
-            would leave fewer than 8 nodes on every axis is dropped).
-        step_length: longest move in one step, in voxels; falls linearly to a tenth of this over a level.
+            would leave fewer than 16 nodes on every axis is dropped).
+        step_length: longest move in one step, in voxels of the map; falls linearly to a tenth of this over a level.
         tolerance: a level stops when 10 steps raised the best similarity by less than this share of its rise so far.
+        map_spacing: spacing of the grid that carries the map, in voxels of the level's images, on levels of more than
+            2^17 voxels, which take as many times fewer steps; smaller ones carry it at every voxel.
         soft_determinant: where a one-sided determinant J is smaller than this, a divergence proportional to
             soft_determinant/J − 1 is asked for, which opens the grid up again; 0 switches it off.
         min_determinant: smallest one-sided determinant that a step may leave; a step that would go below is shortened.
@@ -70,13 +72,14 @@ class RegistrationSettings:
     start: str = "identity"
     similarity: str | Mapping[str, float] = "lncc"
     window: int = 9
-    weight_div: float = 1.0
+    weight_div: float = 0.3
     weight_curl: float = 1.0
-    length: float | tuple[float, ...] = (24.0, 24.0, 12.0)
+    length: float | tuple[float, ...] = 8.0
     power: int = 1
-    steps: tuple[int, ...] = (100, 100, 30)
+    steps: tuple[int, ...] = (60, 60, 60)
     step_length: float = 0.5
-    tolerance: float = 0.02
+    tolerance: float = 0.01
+    map_spacing: float = 2.0
     soft_determinant: float = 0.15
     min_determinant: float = 0.03
     points_weight: float = 0.0
@@ -101,6 +104,8 @@ class RegistrationSettings:
         for name in ("weight_div", "weight_curl", "step_length"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be positive and finite, got {getattr(self, name)}")
+        if not 1 <= self.map_spacing <= 8:
+            raise InputError(f"map_spacing must lie between 1 and 8 voxels, got {self.map_spacing}")
         for name in ("soft_determinant", "tolerance", "points_weight"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be finite and not negative, got {getattr(self, name)}")

@@ -13,15 +13,14 @@ from torch import Tensor
 
 from torchdeform.grid import Grid
 from torchdeform.image import Image
-from torchdeform.report.overview import Plane, frame, middle_planes, to_unit
+from torchdeform.report.drawing import INK, PAPER, frame, tinted
+from torchdeform.report.planes import Plane, planes_of
+from torchdeform.report.scene import to_unit
 from torchdeform.warp import sample
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_INK, _PAPER = "#222222", "#ffffff"
-# Blue and orange, told apart by everybody; their sum is white.
-_COLOURS = ((0.0, 0.45, 1.0), (1.0, 0.55, 0.0))
 _OUTLINES = ("#0b5fa5", "#b34700")
 _PANEL_INCHES = 3.0
 _PIXELS = 400  # along the longer side of a picture
@@ -51,29 +50,28 @@ def write_overlay(path: Path, fixed: Image, moving: Image) -> None:
     cuts = _cuts(fixed, moving)
     heights = [_PANEL_INCHES * min(2.0, max(0.4, cut.plane.height_over_width)) for cut in cuts]
     size = (3 * _PANEL_INCHES, sum(heights) + 0.3 * len(cuts) + 0.5)
-    figure = Figure(size, dpi=110, layout="constrained", facecolor=_PAPER)
+    figure = Figure(size, dpi=110, layout="constrained", facecolor=PAPER)
     cells = figure.subplots(len(cuts), 3, squeeze=False, height_ratios=heights)
     for row, cut in zip(cells, cuts, strict=True):
         _draw_row(row, cut, titled=cut is cuts[0])
-    figure.suptitle("fixed in blue, moving in orange, frames where they end", fontsize=11, color=_INK)
+    figure.suptitle("fixed in blue, moving in orange, frames where they end", fontsize=11, color=INK)
     FigureCanvasAgg(figure).print_png(str(path))
 
 
 def _draw_row(row: "Sequence[Axes]", cut: _Cut, *, titled: bool) -> None:
-    colours = [value[..., None] * np.array(colour) for value, colour in zip(cut.values, _COLOURS, strict=True)]
-    pictures = {"fixed": cut.values[0], "moving": cut.values[1], "overlay": np.clip(sum(colours), 0, 1)}
+    pictures = {"fixed": cut.values[0], "moving": cut.values[1], "overlay": tinted(*cut.values)}
     for axes, (title, picture) in zip(row, pictures.items(), strict=True):
         axes.imshow(picture, cmap="gray", vmin=0, vmax=1, aspect=cut.plane.aspect)
         for inside, colour in zip(cut.inside, _OUTLINES, strict=True):
             if inside.any() and not inside.all():
                 axes.contour(inside.astype(np.float32), levels=[0.5], colors=[colour], linewidths=0.9)
         frame(axes, cut.plane)
-        axes.set_title(title if titled else "", fontsize=10, color=_INK)
+        axes.set_title(title if titled else "", fontsize=10, color=INK)
 
 
 def _cuts(fixed: Image, moving: Image) -> list[_Cut]:
     canvas = _canvas(fixed, moving)
-    return [_cut(plane, canvas, (fixed, moving)) for plane in middle_planes(canvas)]
+    return [_cut(plane, canvas, (fixed, moving)) for plane in planes_of(canvas)]
 
 
 def _canvas(fixed: Image, moving: Image) -> Image:
@@ -97,12 +95,7 @@ def _corners(grid: Grid) -> Tensor:
 
 def _cut(plane: Plane, canvas: Image, images: tuple[Image, Image]) -> _Cut:
     """Sample both images in one plane of the canvas; only its points are made."""
-    steps = [
-        torch.arange(n, dtype=torch.float64) * h for n, h in zip(canvas.grid.shape, canvas.grid.spacing, strict=True)
-    ]
-    for axis in set(range(canvas.grid.dim)) - set(plane.axes):
-        steps[axis] = steps[axis].new_tensor([canvas.grid.extent[axis] / 2])
-    world = canvas.to_world(torch.stack(torch.meshgrid(*steps, indexing="ij")).unsqueeze(0))
+    world = canvas.to_world(plane.points([plane.middle]))
     found = [_values(image, world, plane) for image in images]
     return _Cut(plane, (found[0][0], found[1][0]), (found[0][1], found[1][1]))
 
@@ -111,7 +104,5 @@ def _values(image: Image, world: Tensor, plane: Plane) -> tuple[NDArray[np.float
     data = image.data.detach().cpu()
     grey = to_unit(data[:, :3], data).mean(1, keepdim=True).float()
     points = image.to_grid(world)
-    values = sample(grey, points, image.grid, outside=torch.nan)[0, 0].numpy()
-    flat = values.reshape([values.shape[axis] for axis in sorted(plane.axes)])
-    flat = flat if plane.axes[0] < plane.axes[1] else flat.T
+    flat = plane.arrange(sample(grey, points, image.grid, outside=torch.nan))[0, 0].numpy()
     return np.nan_to_num(flat), ~np.isnan(flat)

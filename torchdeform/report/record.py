@@ -6,6 +6,7 @@ import platform
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -15,7 +16,7 @@ from torchdeform.registration.evaluation import Evaluation, Measures
 from torchdeform.registration.result import LevelRecord, RegistrationResult
 
 
-def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[str, object]:
+def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[str, Any]:
     """Return the record of one registered pair as plain numbers, strings, lists and mappings.
 
     Args:
@@ -42,6 +43,7 @@ def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[st
         "seconds": result.seconds,
         "alignment": _alignment(result),
         "evaluation": _evaluation(result.evaluation),
+        "label_interpolation": result.evaluation and result.evaluation.label_interpolation,
         "levels": [_level(level) for level in result.levels],
         "device": device_name(result.displacement.device),
         "settings": asdict(result.settings),
@@ -120,8 +122,13 @@ def versions() -> dict[str, str]:
 
 
 def write_json(record: Mapping[str, object], path: Path) -> None:
-    """Write a record as JSON that every reader takes: numbers that are not finite become null."""
-    path.write_text(json.dumps(_plain(record), indent=2, allow_nan=False, default=str) + "\n", encoding="utf-8")
+    """Write a record as `as_json` makes it, a figure a line."""
+    path.write_text(as_json(record, indent=2) + "\n", encoding="utf-8")
+
+
+def as_json(record: Mapping[str, object], indent: int | None = None) -> str:
+    """Return a record as JSON that every reader takes: numbers that are not finite become null."""
+    return json.dumps(_plain(record), indent=indent, allow_nan=False, default=str)
 
 
 def _plain(value: object) -> object:

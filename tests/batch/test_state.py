@@ -1,0 +1,176 @@
+"""The journal and the prints of inputs: what a crash leaves can be read, and what changed is noticed."""
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from torchdeform.batch.job import Job
+from torchdeform.batch.state import JOURNAL, Journal, Record
+from torchdeform.batch.task import DONE, FAILED, Report
+from torchdeform.errors import InputError
+from torchdeform.pair import PairFiles
+from torchdeform.registration.settings import RegistrationSettings
+
+REPORT = Report(DONE, "", 1.5, 4, 0, {"folds": 0, "dice_after": 0.9}, ("warped.png", "result.json"))
+
+
+@pytest.fixture
+def job(tmp_path) -> Job:
+    """A pair of two files that are no images, which is all the same here."""
+    for name in ("fixed.png", "moving.png"):
+        (tmp_path / name).write_text(name, encoding="ascii")
+    files = PairFiles(fixed=tmp_path / "fixed.png", moving=tmp_path / "moving.png", out=tmp_path / "out" / "a")
+    return Job(name="a", files=files, settings=RegistrationSettings())
+
+
+def fingerprint(folder: Path, job: Job) -> str:
+    with Journal(folder / "out") as journal:
+        return journal.fingerprint(job)
+
+
+def records(folder: Path) -> dict[str, Record]:
+    with Journal(folder) as journal:
+        return journal.records
+
+
+def test_what_is_recorded_is_read_again(tmp_path):
+    written = {name: Record(name, f"key {name}", REPORT) for name in ("a", "b")}
+    with Journal(tmp_path) as journal:
+        for record in written.values():
+            journal.record(record)
+    assert records(tmp_path) == written
+
+
+def test_the_last_line_of_a_pair_counts(tmp_path):
+    with Journal(tmp_path) as journal:
+        journal.record(Record("a", "1", Report(FAILED, "why")))
+        journal.record(Record("a", "2", REPORT))
+    assert records(tmp_path) == {"a": Record("a", "2", REPORT)}
+    assert len((tmp_path / JOURNAL).read_text(encoding="utf-8").splitlines()) == 2
+
+
+def test_a_line_torn_anywhere_costs_that_line_only(tmp_path):
+    with Journal(tmp_path) as journal:
+        journal.record(Record("a", "1", REPORT))
+        whole = (tmp_path / JOURNAL).read_bytes()
+        journal.record(Record("b", "2", REPORT))
+    second = (tmp_path / JOURNAL).read_bytes()[len(whole) :]
+    for length in range(len(second)):
+        (tmp_path / JOURNAL).write_bytes(whole + second[:length])
+        with Journal(tmp_path) as journal:
+            assert "a" in journal.records
+            journal.record(Record("c", "3", REPORT))
+        assert records(tmp_path).keys() - {"b"} == {"a", "c"}
+
+
+@pytest.mark.parametrize(
+    "line", [b"\xff\xfe\n", b"[]\n", b"3\n", b"{}\n", b'{"pair": "b"}\n', b'{"file": "f", "x": 1}\n', b"\0\n"]
+)
+def test_lines_that_make_no_sense_are_skipped(tmp_path, line):
+    with Journal(tmp_path) as journal:
+        journal.record(Record("a", "1", REPORT))
+    with (tmp_path / JOURNAL).open("ab") as file:
+        file.write(line)
+    assert records(tmp_path).keys() == {"a"}
+
+
+def test_two_runs_of_one_folder_are_refused(tmp_path):
+    with Journal(tmp_path), pytest.raises(InputError, match="another run is at work"):
+        Journal(tmp_path)
+    with Journal(tmp_path):
+        pass
+
+
+def test_a_file_in_the_folders_place_is_refused(tmp_path):
+    (tmp_path / "out").touch()
+    with pytest.raises(InputError, match="cannot write to"):
+        Journal(tmp_path / "out")
+
+
+def test_the_print_depends_on_content_not_on_paths_or_dates(tmp_path, job):
+    before = fingerprint(tmp_path, job)
+    os.utime(job.files.fixed, (1, 1))
+    assert fingerprint(tmp_path, job) == before
+    elsewhere = tmp_path / "elsewhere.png"
+    job.files.fixed.rename(elsewhere)
+    moved = replace(job, files=replace(job.files, fixed=elsewhere, out=tmp_path / "other"))
+    assert fingerprint(tmp_path, moved) == before
+    elsewhere.write_text("FIXED.png", encoding="ascii")
+    assert fingerprint(tmp_path, moved) != before
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda job: replace(job, settings=replace(job.settings, window=7)),
+        lambda job: replace(job, device="cpu"),
+        lambda job: replace(job, memory=10**9),
+        lambda job: replace(job, voxels=True),
+        lambda job: replace(job, files=replace(job.files, fixed=job.files.moving, moving=job.files.fixed)),
+        lambda job: replace(job, files=replace(job.files, fixed_mask=job.files.fixed)),
+    ],
+)
+def test_the_print_depends_on_all_that_results_depend_on(tmp_path, job, change):
+    assert fingerprint(tmp_path, change(job)) != fingerprint(tmp_path, job)
+
+
+def test_the_print_depends_on_the_version(tmp_path, job, monkeypatch):
+    before = fingerprint(tmp_path, job)
+    monkeypatch.setattr("torchdeform.batch.state.__version__", "another")
+    assert fingerprint(tmp_path, job) != before
+
+
+def test_a_file_that_comes_back_changes_the_print(tmp_path, job):
+    job.files.fixed.rename(tmp_path / "aside")
+    missing = fingerprint(tmp_path, job)
+    (tmp_path / "aside").rename(job.files.fixed)
+    assert fingerprint(tmp_path, job) != missing
+
+
+def test_pixels_in_a_file_of_their_own_count(tmp_path, job):
+    (tmp_path / "fixed.mhd").write_text("ElementDataFile = fixed.raw", encoding="ascii")
+    (tmp_path / "fixed.raw").write_bytes(b"1")
+    detached = replace(job, files=replace(job.files, fixed=tmp_path / "fixed.mhd"))
+    before = fingerprint(tmp_path, detached)
+    (tmp_path / "fixed.raw").write_bytes(b"2")
+    assert fingerprint(tmp_path, detached) != before
+
+
+@pytest.mark.parametrize("given", ["series", "series/1.dcm"])
+def test_every_slice_of_a_series_counts(tmp_path, job, given):
+    (tmp_path / "series").mkdir()
+    for name in ("1.dcm", "2.dcm"):
+        (tmp_path / "series" / name).write_bytes(b"\0" * 128 + b"DICM")
+    of_series = replace(job, files=replace(job.files, fixed=tmp_path / given))
+    before = fingerprint(tmp_path, of_series)
+    (tmp_path / "series" / "2.dcm").write_bytes(b"\0" * 128 + b"DICM2")
+    assert fingerprint(tmp_path, of_series) != before
+
+
+def test_a_file_of_the_same_size_and_date_is_not_read_again(tmp_path, job, monkeypatch):
+    for path in (job.files.fixed, job.files.moving):
+        os.utime(path, (1e9, 1e9))
+    before = fingerprint(tmp_path, job)
+    monkeypatch.setattr("torchdeform.batch.state.hashlib.file_digest", lambda *_: pytest.fail("a file was read"))
+    assert fingerprint(tmp_path, job) == before
+
+
+def test_the_date_of_a_file_just_written_is_not_trusted(tmp_path, job):
+    """Written again within a tick of the clock, it may have the same size and date."""
+    before, status = fingerprint(tmp_path, job), job.files.fixed.stat()
+    job.files.fixed.write_text("FIXED.png", encoding="ascii")
+    os.utime(job.files.fixed, ns=(status.st_atime_ns, status.st_mtime_ns))
+    assert fingerprint(tmp_path, job) != before
+
+
+def test_a_record_is_one_line_of_json_on_the_disk(tmp_path, monkeypatch):
+    synced = []
+    monkeypatch.setattr("torchdeform.batch.state.os.fsync", lambda file: synced.append(os.fstat(file).st_size))
+    with Journal(tmp_path) as journal:
+        journal.record(Record("a", "1", Report(FAILED, "line one\nline two")))
+    text = (tmp_path / JOURNAL).read_text(encoding="utf-8")
+    assert json.loads(text)["sentence"] == "line one\nline two"
+    assert synced[-1] == len(text)

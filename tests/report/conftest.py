@@ -1,0 +1,73 @@
+"""What the tests of the report share: a registration that is known beforehand, with everything that it may have."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from torchdeform.registration.affine import Alignment
+from torchdeform.registration.evaluation import Evaluation, Measures
+from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.report.record import describe
+from torchdeform.report.scene import Scene, make_scene
+from torchdeform.report.shell import repeat_command
+from torchdeform.transform import Affine
+
+SHAPES = {2: (40, 52), 3: (20, 26, 31)}
+NASTY = "<script>alert('x')</script> & \"more\""
+
+
+@pytest.fixture(autouse=True)
+def _closed_figures() -> Iterator[None]:
+    """Figures of pyplot are closed after every test."""
+    yield
+    from matplotlib import pyplot
+
+    pyplot.close("all")
+
+
+@pytest.fixture
+def make_full(make_image, make_result) -> Callable[..., tuple[Scene, dict[str, Any]]]:
+    """Return ``make_full(dim)``: a scene and a record with an alignment, labels, landmarks, warnings and commands."""
+
+    def make(dim: int, *, labels: int = 3, landmarks: int = 4, **images: Any) -> tuple[Scene, dict[str, Any]]:
+        shape = images.pop("shape", SHAPES[dim])
+        fixed = make_image(shape, name=f"/data/{NASTY}/fixed{NASTY}.nii.gz", **images)
+        moving = make_image(tuple(n - 3 for n in shape), (1.1,) * dim, name="moving.nii.gz", **images)
+        settings = RegistrationSettings(similarity={"lncc": 1.0, "mi": 0.5}, steps=(5, 4))
+        result = make_result(fixed, moving, settings)
+        shift = Affine(torch.eye(dim, dtype=torch.float64), torch.ones(dim, dtype=torch.float64))
+        result = replace(
+            result,
+            affine=shift,
+            alignment=Alignment(shift, 0.1, 0.2, "centres", 0.5, ()),
+            evaluation=_evaluation(labels, landmarks),
+        )
+        record = describe(result, fixed, moving)
+        inputs = {"fixed": fixed.name, "moving": moving.name, "out": "my results"}
+        record |= {
+            "inputs": inputs,
+            "warnings": (f"this is odd: {NASTY}",),
+            "seconds": {"read": 0.1, **result.seconds},
+            "memory": {"read": 10**8, "optimise": 2 * 10**9},
+            "command": repeat_command(inputs, settings, "cpu", 10**9),
+            "folder": "/home/somebody",
+        }
+        return make_scene(fixed, moving, result, slices=7), record
+
+    return make
+
+
+def _evaluation(labels: int, landmarks: int) -> Evaluation:
+    def measures(dice: float, distance: float) -> Measures:
+        overlap = torch.full((1, labels), dice, dtype=torch.float64)
+        return Measures(
+            labels=tuple(range(1, labels + 1)),
+            dice=overlap,
+            hausdorff=1 / overlap,
+            distances=torch.full((1, landmarks), distance, dtype=torch.float64),
+        )
+
+    return Evaluation(measures(0.4, 9.0), measures(0.5, 4.0), measures(0.8, 1.5))

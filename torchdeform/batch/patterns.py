@@ -1,0 +1,145 @@
+"""Patterns of paths with named parts, ``sub-{subject}/ses-{session}/*_T1w.nii.gz``: finding files, and filling in."""
+
+import glob
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchdeform.errors import InputError, nearest_name
+
+_TOKENS = re.compile(r"\{(?P<part>[A-Za-z_]\w*)\}|(?P<folders>\*\*/)|\[(?P<one>[^\]]+)\]|(?P<any>\*+)|(?P<single>\?)")
+_SPECIAL = frozenset("*?[{}")
+_ANYTHING = "[^/]+?"
+
+
+@dataclass(frozen=True)
+class Found:
+    """A file that a pattern matches, and the parts of its path that the pattern names."""
+
+    path: Path
+    parts: Mapping[str, str]
+
+
+def literal(text: str) -> str:
+    """Return the pattern that matches this text only."""
+    return "".join(f"[{character}]" if character in _SPECIAL else character for character in text)
+
+
+def part_names(pattern: str) -> tuple[str, ...]:
+    """Return the names of the parts of a pattern, in their order.
+
+    Raises:
+        InputError: a brace that belongs to no name.
+    """
+    rest = _TOKENS.sub("", pattern)
+    if "{" in rest or "}" in rest:
+        raise InputError(f"{pattern!r}: a part is written {{name}}, with letters, digits and _ only")
+    return tuple(dict.fromkeys(token["part"] for token in _TOKENS.finditer(pattern) if token["part"]))
+
+
+def find(pattern: str, parts: Mapping[str, str]) -> list[Found]:
+    """Return the files that match a pattern, sorted by their paths, numbers in them by their size.
+
+    Args:
+        pattern: absolute path with ``*``, ``?``, ``[abc]``, ``**/`` for any folders, and ``{part}``; a part that stands
+            there twice is the same in both places.
+        parts: what a part may be, as a regular expression by its name; anything but / where none is given.
+    """
+    expression = _compiled(_translated(pattern, parts), pattern)
+    found = ((Path(path), expression.fullmatch(Path(path).as_posix())) for path in _matching(pattern))
+    return _sorted([Found(path, match.groupdict()) for path, match in found if match])
+
+
+def search(folder: Path, expression: str) -> list[Found]:
+    """Return the files below a folder whose path there is matched, whole, by a regular expression with named groups."""
+    compiled = _compiled(expression, expression)
+    files = (path for path in folder.rglob("*") if not path.is_dir())
+    found = ((path, compiled.fullmatch(path.relative_to(folder).as_posix())) for path in files)
+    return _sorted([Found(path, match.groupdict("")) for path, match in found if match])
+
+
+def fill(pattern: str, parts: Mapping[str, str]) -> str:
+    """Return a pattern with its parts filled in."""
+    return _TOKENS.sub(lambda token: literal(parts[token["part"]]) if token["part"] else token[0], pattern)
+
+
+def only(pattern: str) -> Path:
+    """Return the one file that a pattern without parts matches.
+
+    A pattern that matches one path only is that path, whether it exists or not.
+
+    Raises:
+        InputError: several files match, or none.
+    """
+    plain = _plain(pattern)
+    if not _TOKENS.search(re.sub(r"\[[*?[{}]\]", "", pattern)):
+        return Path(plain)
+    paths = sorted(_matching(pattern))
+    if len(paths) == 1:
+        return Path(paths[0])
+    seen = f"{len(paths)} files match: {paths[0]}, {paths[1]} ..." if paths else "no file matches"
+    raise InputError(f"{plain} must match one file, and {seen}")
+
+
+def require_parts(names: Mapping[str, object] | tuple[str, ...], known: tuple[str, ...], where: str) -> None:
+    """Raise `InputError` unless every name is one of the known parts."""
+    for name in names:
+        if name not in known:
+            have = f"the parts are {', '.join(known)}" if known else "no part is named, as {subject} would"
+            raise InputError(f"{where}: there is no part '{name}'{nearest_name(name, known) or f'; {have}'}")
+
+
+def natural(text: str) -> list[tuple[bool, int, str]]:
+    """Return a key by which ``ses-2`` comes before ``ses-10``."""
+    pieces = re.findall(r"[0-9]+|[^0-9]+", text)
+    return [(not piece.isdecimal(), int(piece) if piece.isdecimal() else 0, piece) for piece in pieces]
+
+
+def _matching(pattern: str) -> list[str]:
+    """Return the paths that a pattern may mean, files that are hidden left out."""
+    return glob.glob(_TOKENS.sub(_to_glob, pattern), recursive=True)  # noqa: PTH207 - pathlib takes hidden files too
+
+
+def _sorted(found: list[Found]) -> list[Found]:
+    return sorted(found, key=lambda one: natural(one.path.as_posix()))
+
+
+def _plain(pattern: str) -> str:
+    """Return a pattern as a person would read it."""
+    return re.sub(r"\[([*?[{}])\]", r"\1", pattern)
+
+
+def _to_glob(token: re.Match[str]) -> str:
+    if token["any"]:
+        return "*"  # two of them within a name are one
+    return token[0] if not token["part"] else "*"
+
+
+def _translated(pattern: str, parts: Mapping[str, str]) -> str:
+    """Return the regular expression of a pattern."""
+    pieces, last, seen = [], 0, set()
+    for token in _TOKENS.finditer(pattern):
+        pieces += [re.escape(pattern[last : token.start()]), _piece(token, parts, seen)]
+        last = token.end()
+    return "".join([*pieces, re.escape(pattern[last:])])
+
+
+def _piece(token: re.Match[str], parts: Mapping[str, str], seen: set[str]) -> str:
+    """Return the regular expression of a token; ``seen`` are the parts to its left."""
+    if name := token["part"]:
+        if name in seen:
+            return f"(?P={name})"
+        seen.add(name)
+        return f"(?P<{name}>{parts.get(name, _ANYTHING)})"
+    if one := token["one"]:
+        escaped = re.sub(r"([\\\[^&~|])", r"\\\1", one.removeprefix("!"))
+        return f"[{'^' * one.startswith('!')}{escaped}]"
+    return {"folders": r"(?:[^/]+/)*", "any": "[^/]*", "single": "[^/]"}[token.lastgroup or ""]
+
+
+def _compiled(expression: str, shown: str) -> re.Pattern[str]:
+    try:
+        return re.compile(expression)
+    except re.error as error:
+        raise InputError(f"{shown!r} makes no regular expression: {error}; check parts") from error

@@ -1,0 +1,173 @@
+"""What a cohort comes to: its pairs as jobs, those that cannot run, and what all of it will take."""
+
+import json
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from torchdeform import __version__
+from torchdeform.batch.cohort import Cohort
+from torchdeform.batch.entry import Entry, select
+from torchdeform.batch.job import Job
+from torchdeform.batch.learn2reg import submission_name
+from torchdeform.batch.sources import entries
+from torchdeform.errors import InputError, nearest_name
+from torchdeform.pair import PairFiles
+from torchdeform.registration.settings import RegistrationSettings
+
+SUBMISSION = "submission"
+DESCRIPTION = "dataset_description.json"
+
+# What stands in a cohort's folder beside the pairs, so no pair may be called so.
+_RESERVED = (
+    "logs",
+    SUBMISSION,
+    "journal.jsonl",
+    "summary.csv",
+    "failures.csv",
+    "index.html",
+    "events.jsonl",
+    DESCRIPTION,
+)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A pair that cannot run: its name, and a sentence that says why."""
+
+    name: str
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a cohort comes to.
+
+    Attributes:
+        out: folder of the cohort's results.
+        jobs: pairs that can run, in the order of the cohort.
+        problems: pairs that cannot.
+    """
+
+    out: Path
+    jobs: tuple[Job, ...]
+    problems: tuple[Problem, ...] = ()
+
+    def only(self, wanted: Iterable[str]) -> "Plan":
+        """Return the plan of the pairs that are called so, begin so (``sub-01``), or match a pattern (``sub-0*``).
+
+        Raises:
+            InputError: a name that no pair has.
+        """
+        names = [one.name for one in (*self.jobs, *self.problems)]
+        kept: set[str] = set()
+        for name in wanted:
+            found = select(names, name)
+            if not found:
+                raise InputError(f"--only: no pair is called {name!r}{nearest_name(name, names)}; see --dry-run")
+            kept.update(found)
+        jobs, problems = ([one for one in some if one.name in kept] for some in (self.jobs, self.problems))
+        return replace(self, jobs=tuple(jobs), problems=tuple(problems))
+
+
+def plan(cohort: Cohort) -> Plan:
+    """Return the jobs of a cohort, and the pairs that cannot run.
+
+    Raises:
+        InputError: no pair at all, two pairs that would write the same place, a name that the folder needs for
+            something else, or settings that are wrong.
+
+    Notes:
+        Of the files only their existence is looked at.
+    """
+    found = entries(cohort)
+    _require_apart(found, lambda entry: f"{entry.subject}/{entry.name}", "be called", "name")
+    if cohort.layout == "learn2reg":
+        whole = [entry for entry in found if not entry.problem]
+        _require_apart(whole, lambda entry: _submission(entry), "be submitted as", "moving image")
+    resolve = _resolver(cohort)
+    jobs: list[Job] = []
+    problems: list[Problem] = []
+    for entry in found:
+        sentence = entry.problem or _missing(entry)
+        if sentence:
+            problems.append(Problem(entry.name, sentence))
+        else:
+            jobs.append(_job(entry, cohort, resolve(entry)))
+    return Plan(cohort.out, tuple(jobs), tuple(problems))
+
+
+def description() -> dict[str, Any]:
+    """Return what a cohort's folder says of itself, in the words of BIDS for derived data."""
+    return {
+        "Name": "Registrations by torchdeform",
+        "BIDSVersion": "1.10.0",
+        "DatasetType": "derivative",
+        "GeneratedBy": [{"Name": "torchdeform", "Version": __version__}],
+    }
+
+
+def _require_apart(found: Sequence[Entry], place: Callable[[Entry], str], verb: str, remedy: str) -> None:
+    """Raise `InputError` if two pairs would write one place; capitals do not count, as on some disks."""
+    seen: dict[str, Entry] = {}
+    for entry in found:
+        key = place(entry)
+        first = seen.setdefault(key.casefold(), entry)
+        if first is not entry:
+            both = f"{_between(first)} ({first.where}) and {_between(entry)} ({entry.where})"
+            raise InputError(f"{both} would both {verb} {key.strip('/')}; give each its own {remedy}")
+        if entry.name.casefold() in _RESERVED or entry.name.startswith("."):
+            raise InputError(f"{entry.where}: a pair cannot be called {entry.name}, which the results need; rename it")
+
+
+def _between(entry: Entry) -> str:
+    ends = [str(entry.files[side]) for side in ("moving", "fixed") if side in entry.files]
+    return " to ".join(ends) or entry.name
+
+
+def _resolver(cohort: Cohort) -> Callable[[Entry], RegistrationSettings]:
+    """Return what resolves a pair's settings, each set of them once."""
+    known: dict[str, RegistrationSettings] = {}
+
+    def resolve(entry: Entry) -> RegistrationSettings:
+        key = json.dumps(entry.settings, sort_keys=True, default=str)
+        if key not in known:
+            try:
+                known[key] = cohort.resolve(entry.settings)
+            except InputError as error:
+                raise InputError(f"{entry.where}: {error}") from error
+        return known[key]
+
+    return resolve
+
+
+def _missing(entry: Entry) -> str:
+    """Return what files a pair lacks, as a sentence, empty if none."""
+    for key, path in entry.files.items():
+        if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises where a folder may not be looked into
+            return f"{key} {path} does not exist; check {entry.where}"
+    for what in ("points", "labels"):
+        given = [side for side in ("fixed", "moving") if f"{side}_{what}" in entry.files]
+        if len(given) == 1:
+            other = {"fixed": "moving", "moving": "fixed"}[given[0]]
+            return f"{given[0]}_{what} needs {other}_{what} too, give both or neither; check {entry.where}"
+    return ""
+
+
+def _job(entry: Entry, cohort: Cohort, settings: RegistrationSettings) -> Job:
+    files = PairFiles(**entry.files, out=cohort.out / entry.subject / entry.name)
+    return Job(
+        name=entry.name,
+        files=files,
+        settings=settings,
+        device=cohort.device,
+        memory=cohort.memory,
+        submission=cohort.out / SUBMISSION / _submission(entry) if cohort.layout == "learn2reg" else None,
+        voxels=entry.voxels and entry.files.keys() >= {"fixed_points", "moving_points"},
+    )
+
+
+def _submission(entry: Entry) -> str:
+    return submission_name(entry.files["fixed"], entry.files["moving"])

@@ -1,0 +1,1 @@
+"""Templates: the mean shape and intensity of many images."""

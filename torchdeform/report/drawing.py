@@ -1,0 +1,206 @@
+"""How slices are drawn on matplotlib axes: images, maps with their scales, moved grids, curves."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchdeform.registration.result import RegistrationResult
+from torchdeform.registration.settings import similarity_weights
+from torchdeform.report.planes import Plane
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
+
+INK, PAPER, LINES, FRAME = "#222222", "#ffffff", "#0b5fa5", "#bbbbbb"
+# Blue and orange, told apart by everybody; their sum is white.
+BLUE, ORANGE = (0.0, 0.45, 1.0), (1.0, 0.55, 0.0)
+# Okabe and Ito's colours, which are told apart with any colour blindness; for lines on light and on dark paper.
+CURVES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
+_LARGEST = 1000  # pixels along a side that a panel can show
+
+Floats = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How values become colours: a colour map of matplotlib, its ends, and what to write where."""
+
+    colours: str
+    low: float
+    high: float
+    ticks: tuple[tuple[float, str], ...]
+
+
+def signed_scale(limit: float) -> Scale:
+    """Return a scale around 0, purple below and orange above."""
+    return Scale("PuOr_r", -limit, limit, tuple((v, f"{v:.2g}") for v in (-limit, 0.0, limit)))
+
+
+def length_scale(limit: float, colours: str = "viridis") -> Scale:
+    """Return a scale from 0 up."""
+    return Scale(colours, 0.0, limit, tuple((v, f"{v:.2g}") for v in (0.0, limit)))
+
+
+def difference_scale(limit: float) -> Scale:
+    """Return the scale of both differences."""
+    return length_scale(limit, "inferno")
+
+
+def volume_scale(limit: float) -> Scale:
+    """Return the scale of log J, written as J at powers of 2."""
+    top = int(limit / math.log(2) + 1e-6)
+    ticks = tuple((k * math.log(2), f"{2.0**k:g}") for k in sorted({-top, 0, top}))
+    return Scale("PuOr_r", -limit, limit, ticks)
+
+
+def rotation_scale(limit: float, dim: int) -> Scale:
+    """Return the scale of the curl, which has a sign in 2D, or of its length in 3D."""
+    return signed_scale(limit) if dim == 2 else length_scale(limit)
+
+
+def show(axes: "Axes", plane: Plane, pixels: Tensor, **how: Any) -> "AxesImage":
+    """Show a slice ``(C, down, across)`` in node coordinates: pixel (i, j) spans i ± 1/2, j ± 1/2."""
+    down, across = plane.shape
+    thin = _thin(pixels)
+    shown = axes.imshow(
+        thin if thin.shape[-1] == 3 else thin[..., 0],
+        extent=(-0.5, across - 0.5, down - 0.5, -0.5),
+        aspect=plane.aspect,
+        **how,
+    )
+    frame(axes, plane)
+    return shown
+
+
+def _thin(pixels: Tensor) -> NDArray[np.float32]:
+    """Return a slice as ``(down, across, C)``, every so many pixels where there are more than can be seen."""
+    step = 1 + max(pixels.shape[1:]) // _LARGEST
+    return pixels[:, ::step, ::step].movedim(0, -1).float().numpy()
+
+
+def frame(axes: "Axes", plane: Plane) -> None:
+    """Frame a slice, turned for the eye."""
+    down, across = plane.shape
+    axes.set_xlim(*_turn((-0.5, across - 0.5), plane.turned[1]))
+    axes.set_ylim(*_turn((down - 0.5, -0.5), plane.turned[0]))
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_color(FRAME)
+
+
+def _turn(ends: tuple[float, float], turned: bool) -> tuple[float, float]:
+    return (ends[1], ends[0]) if turned else ends
+
+
+def draw_image(axes: "Axes", plane: Plane, pixels: Tensor) -> None:
+    """Show grey values or colours from 0 to 1."""
+    show(axes, plane, pixels, cmap="gray", vmin=0, vmax=1)
+
+
+def draw_map(axes: "Axes", plane: Plane, values: Tensor, scale: Scale, *, bar: bool = True) -> None:
+    """Show values in the colours of their scale, with a bar below that says what they mean."""
+    shown = show(axes, plane, values, cmap=scale.colours, vmin=scale.low, vmax=scale.high)
+    if not bar:
+        return
+    place = axes.inset_axes((0.15, -0.08, 0.7, 0.035))
+    colours = axes.figure.colorbar(shown, cax=place, orientation="horizontal")
+    colours.set_ticks([value for value, _ in scale.ticks], labels=[text for _, text in scale.ticks])
+    colours.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    place.tick_params(labelsize=8, colors=INK, length=2, pad=1)
+
+
+def moved_lines(plane: Plane, u: Tensor, count: int) -> list[Floats]:
+    """Return where φ takes the lines of a regular grid in a slice, each ``(m, 2)`` as (across, down) in nodes.
+
+    Args:
+        plane: the plane.
+        u: displacement in the slice ``(D, down, across)``, units of spacing.
+        count: lines along the longer side, about.
+    """
+    at = np.stack(np.meshgrid(*map(np.arange, plane.shape), indexing="ij")).astype(np.float32)
+    for position, axis in enumerate(plane.axes):
+        at[position] += (u[axis] / plane.grid.spacing[axis]).float().numpy()
+    points = np.stack((at[1], at[0]), axis=-1)
+    size = max(side * plane.grid.spacing[axis] for side, axis in zip(plane.shape, plane.axes, strict=True)) / count
+    down, across = (
+        _every(n, max(1, round(size / plane.grid.spacing[axis])))
+        for n, axis in zip(plane.shape, plane.axes, strict=True)
+    )
+    return [*points[down], *points[:, across].swapaxes(0, 1)]
+
+
+def _every(n: int, step: int) -> NDArray[np.int64]:
+    """Return nodes at regular steps, centred in 0 .. n − 1."""
+    return np.arange((n - 1) % step // 2, n, step)
+
+
+def draw_lines(axes: "Axes", plane: Plane, u: Tensor, count: int) -> None:
+    """Draw where φ takes the lines of a regular grid."""
+    from matplotlib.collections import LineCollection
+
+    axes.add_collection(LineCollection(moved_lines(plane, u, count), colors=LINES, linewidths=0.7))
+    frame(axes, plane)
+
+
+def draw_faint(axes: "Axes", plane: Plane, pixels: Tensor) -> None:
+    """Show an image as a pale ground for lines."""
+    show(axes, plane, pixels.mean(0, keepdim=True), cmap="gray_r", vmin=0, vmax=3)
+
+
+def draw_convergence(axes: "Axes", result: RegistrationResult, *, item: int = 0) -> None:
+    """Draw the similarity over the steps, one line per level."""
+    start = 0
+    for level, colour in zip(result.levels, _cycle(CURVES, len(result.levels)), strict=True):
+        values = [value[item].item() for value in level.similarity]
+        size = "×".join(map(str, level.shape[::-1]))
+        alone = "o" if len(values) == 1 else ""
+        axes.plot(range(start, start + len(values)), values, alone + "-", label=size, linewidth=1.6, color=colour)
+        start += max(len(values) - 1, 0)
+    axes.set_xlabel("step", fontsize=9, color=INK)
+    axes.set_ylabel(measure_name(result), fontsize=9, color=INK)
+    _plain(axes)
+    if result.levels:
+        axes.legend(fontsize=8, frameon=False, loc="best")
+
+
+def draw_volumes(axes: "Axes", counts: Tensor, limit: float) -> None:
+    """Draw a histogram of log J between −limit and limit, written as J, in the colours of the map."""
+    from matplotlib import colormaps
+
+    share = 100 * counts.numpy() / max(float(counts.sum()), 1.0)
+    edges = np.linspace(-limit, limit, len(share) + 1)
+    scale, middles = volume_scale(limit), (edges[1:] + edges[:-1]) / 2
+    colours = colormaps[scale.colours]((middles + limit) / (2 * limit))
+    axes.bar(middles, share, width=np.diff(edges), color=colours, edgecolor="#888888", linewidth=0.4)
+    axes.axvline(0, color=INK, linewidth=0.8, linestyle=":")
+    axes.set_xlim(-limit, limit)
+    axes.set_xticks([value for value, _ in scale.ticks], labels=[text for _, text in scale.ticks])
+    axes.set_xlabel("volume: moving / fixed", fontsize=9, color=INK)
+    axes.set_ylabel("% of voxels", fontsize=9, color=INK)
+    _plain(axes)
+
+
+def _plain(axes: "Axes") -> None:
+    axes.tick_params(labelsize=8, colors=INK)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _cycle(colours: Sequence[str], count: int) -> list[str]:
+    return [colours[k % len(colours)] for k in range(count)]
+
+
+def measure_name(result: RegistrationResult) -> str:
+    """Return the similarity that was used, or those that were."""
+    return " + ".join(similarity_weights(result.settings.similarity))
+
+
+def tinted(first: Floats, second: Floats) -> Floats:
+    """Return grey values ``(h, w)`` of two images as one picture: blue, orange, white where both are bright."""
+    return np.clip(first[..., None] * np.array(BLUE) + second[..., None] * np.array(ORANGE), 0, 1)

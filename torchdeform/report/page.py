@@ -1,0 +1,59 @@
+"""``report.html``: one page, complete in itself, on which a person judges a registration."""
+
+import base64
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torchdeform.report.pictures import fitting_pictures
+from torchdeform.report.record import describe
+from torchdeform.report.scene import Scene
+from torchdeform.report.tables import command_lines, file_name, footer, tables, tiles
+from torchdeform.report.verdict import BAD, DOUBTFUL, GOOD, judge
+
+_TEMPLATES = Path(__file__).parent / "templates"
+_MARKS = {GOOD: "✓", DOUBTFUL: "!", BAD: "✗"}
+_MODES = {"swipe": "swipe", "flicker": "flicker", "checkerboard": "checkerboard", "overlay": "two colours"}
+
+
+def write_report(path: Path, scene: Scene, record: Mapping[str, Any] | None = None) -> None:
+    """Write a page with everything that tells whether a registration went well: no network, less than 5 MB.
+
+    Args:
+        path: the file to write, usually ``report.html``.
+        scene: what `make_scene` returns; its slices are those the page can show.
+        record: what ``result.json`` holds; `describe` of the scene's result when None, which knows no commands.
+    """
+    known = describe(scene.result, scene.fixed, scene.moving) if record is None else record
+    page = _render(
+        verdict=judge(known),
+        marks=_MARKS,
+        modes=_MODES,
+        fixed_name=file_name(known["fixed"]),
+        moving_name=file_name(known["moving"]),
+        tiles=tiles(known),
+        tables=tables(known),
+        commands=command_lines(known),
+        footer=footer(known),
+        **fitting_pictures(scene),
+    )
+    path.write_text(page, encoding="utf-8")
+
+
+def _render(**context: object) -> str:
+    """Fill the template: everything but our own style and script is escaped, and no other script can run."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    style, script = (Markup((_TEMPLATES / f"report.{kind}").read_text(encoding="utf-8")) for kind in ("css", "js"))
+    known = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    page = environment.get_template("report.html")
+    return page.render(style=style, script=script, script_hash=f"sha256-{known}", **context)

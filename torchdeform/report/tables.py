@@ -1,0 +1,218 @@
+"""What the page says in figures: tiles, tables, commands."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchdeform.registration.settings import similarity_weights
+from torchdeform.report.shell import apply_commands
+from torchdeform.report.verdict import ends, number, value
+
+_LONG = 12  # rows that are shown without asking
+_STAGES = {"before": "before", "aligned": "aligned", "after": "after"}
+
+Record = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One figure in large type, with its name above and what it means below."""
+
+    name: str
+    value: str
+    small: str
+
+
+@dataclass(frozen=True)
+class Part:
+    """Rows of a table below their heads.
+
+    ``fold`` is what to click on to see them, empty where they are open; ``words`` says how many columns after the first
+    hold words, not figures.
+    """
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    fold: str = ""
+    words: int = 0
+
+
+@dataclass(frozen=True)
+class Table:
+    """A section of figures."""
+
+    title: str
+    parts: Sequence[Part]
+    summary: str = ""
+
+
+def file_name(place: Mapping[str, Any]) -> str:
+    """Return the name of an image's file, without its folder."""
+    return Path(str(place["path"])).name or str(place["path"])
+
+
+def tiles(record: Record) -> list[Tile]:
+    """Return the figures that matter most."""
+    measure = " + ".join(similarity_weights(record["similarity"]))
+    frames = {2: 4, 3: 10}[len(record["fixed"]["size"])]
+    low, high = number(record["determinant_min"]), number(record["determinant_max"])
+    return [
+        Tile(
+            "Folds",
+            f"{record['folds']:,}",
+            f"voxels where one of the {frames} one-sided determinants is not positive",
+        ),
+        Tile(
+            f"Similarity ({measure})",
+            f"{number(record['similarity_before'])} → {number(record['similarity_after'])}",
+            "before → after deforming; higher is better",
+        ),
+        *_known(record),
+        Tile("Volume, moving / fixed", f"{low} to {high}", "smallest and largest determinant of the map"),
+        Tile(
+            "Error of the inverse",
+            f"{_voxels(record['inverse_error_mean'])}",
+            f"on average; {_voxels(record['inverse_error_max'])} at most",
+        ),
+        Tile("Time", _seconds(sum(record["seconds"].values())), f"on {record['device']}"),
+    ]
+
+
+def _known(record: Record) -> list[Tile]:
+    """Return tiles for labels and landmarks, where they were given."""
+    found = []
+    for key, name, unit, about in (
+        ("dice_mean", "Dice of the labels", "", "mean overlap before → after all; 1 is perfect"),
+        ("landmark_error_mean", "Distance of landmarks", " mm", "mean before → after all; 0 is perfect"),
+    ):
+        before, after = ends(record, key)
+        if math.isfinite(after):
+            found.append(Tile(name, f"{number(before)} → {number(after)}{unit}", about))
+    return found
+
+
+def _voxels(length: float | None) -> str:
+    return "< 0.001 voxel" if 0 <= value(length) < 1e-3 else f"{number(length)} voxel"
+
+
+def _seconds(time: float) -> str:
+    return f"{time:.1f} s" if time < 90 else f"{time / 60:.1f} min"
+
+
+def tables(record: Record) -> list[Table]:
+    """Return the tables of a record: labels, landmarks, what took how long, settings, versions."""
+    found = [_labels(record), _landmarks(record), _levels(record), _costs(record), _images(record), _settings(record)]
+    return [table for table in found if table is not None]
+
+
+def _measures(record: Record) -> dict[str, Mapping[str, Any]]:
+    """Return labels' and landmarks' measures by stage, as far as known."""
+    found = record.get("evaluation", {})
+    return {title: found[stage] for stage, title in _STAGES.items() if stage in found}
+
+
+def _labels(record: Record) -> Table | None:
+    stages = {title: m for title, m in _measures(record).items() if "dice" in m}
+    if not stages:
+        return None
+    after = stages["after"]["dice"]
+    rows = [
+        [label, *(number(m["dice"][label]) for m in stages.values()), *_far(stages, label)]
+        for label in sorted(after, key=lambda label: value(after[label]) if math.isfinite(value(after[label])) else 2.0)
+    ]
+    means = " → ".join(f"{number(m['dice_mean'])} {title}" for title, m in stages.items())
+    head = ["label", *(f"Dice {title}" for title in stages), *(f"distance {title}" for title in ("before", "after"))]
+    summary = (
+        f"Mean Dice {means}, over {len(after)} labels; the worst come first. Distance: 95 % Hausdorff, in mm or the "
+        "unit of the files."
+    )
+    return Table("Labels", [_foldable(head, rows, f"All {len(rows)} labels")], summary)
+
+
+def _far(stages: Mapping[str, Mapping[str, Any]], label: str) -> list[str]:
+    return [number(stages[title]["hausdorff_95"][label]) for title in ("before", "after")]
+
+
+def _landmarks(record: Record) -> Table | None:
+    stages = {title: m for title, m in _measures(record).items() if "landmark_errors" in m}
+    if not stages:
+        return None
+    head = ["distance in mm", *stages]
+    whole = [
+        [kind, *(number(m[f"landmark_error_{kind}"]) for m in stages.values())] for kind in ("mean", "median", "max")
+    ]
+    each = zip(*(m["landmark_errors"] for m in stages.values()), strict=True)
+    rows = [[f"{place}", *map(number, row)] for place, row in enumerate(each, start=1)]
+    return Table("Landmarks", [Part(head, whole), _foldable(["landmark", *stages], rows, f"All {len(rows)} landmarks")])
+
+
+def _foldable(head: list[str], rows: list[list[str]], title: str) -> Part:
+    return Part(head, rows, title if len(rows) > _LONG else "")
+
+
+def _levels(record: Record) -> Table | None:
+    rows = [
+        [
+            "×".join(map(str, level["size"])),
+            f"{max(len(level['similarity']) - 1, 0)}",
+            f"{number(level['similarity'][0])} → {number(level['similarity'][-1])}" if level["similarity"] else "–",
+            f"{level['shortened']}",
+            _seconds(level["seconds"]),
+        ]
+        for level in record["levels"]
+    ]
+    head = ["level", "steps", "similarity", "steps shortened, so as not to fold", "time"]
+    return Table("Levels, coarse to fine", [Part(head, rows)]) if rows else None
+
+
+def _costs(record: Record) -> Table:
+    """Return the time of each stage, and the most memory that was held until its end."""
+    held = record.get("memory") or {}
+    rows = [
+        [stage, _seconds(seconds), f"{held[stage] / 1e9:.2f} GB" if held.get(stage) else "–"]
+        for stage, seconds in record["seconds"].items()
+    ]
+    return Table("Time and memory", [Part(["stage", "time", "memory, at most until then"], rows)])
+
+
+def _images(record: Record) -> Table:
+    rows = []
+    for name in ("fixed", "moving"):
+        place = record[name]
+        size, spacing = ("×".join(number(v) for v in place[key]) for key in ("size", "spacing"))
+        rows.append([name, str(place["path"]), size, spacing, f"{place['channels']}", str(place["pixel_type"])])
+    inputs = [
+        [option.replace("_", " "), path, "", "", "", ""]
+        for option, path in record.get("inputs", {}).items()
+        if option not in ("fixed", "moving")
+    ]
+    return Table("Files", [Part(["", "file", "voxels", "spacing", "channels", "type"], rows + inputs, words=1)])
+
+
+def _settings(record: Record) -> Table:
+    given = [[name, _plain(setting)] for name, setting in record["settings"].items()]
+    versions = [[name, str(version)] for name, version in record["versions"].items()]
+    parts = [Part(["setting", "value"], given, "All settings", words=1), Part(["version of", ""], versions, words=1)]
+    return Table("Settings and versions", parts)
+
+
+def _plain(setting: object) -> str:
+    if isinstance(setting, Mapping):
+        return ", ".join(f"{key}: {_plain(item)}" for key, item in setting.items())
+    return ", ".join(map(str, setting)) if isinstance(setting, list | tuple) else str(setting)
+
+
+def command_lines(record: Record) -> dict[str, str]:
+    """Return the commands to repeat and to apply a registration by what they do, as far as its record knows them."""
+    if "command" not in record:
+        return {}
+    again = {f"Repeat this registration, in {record['folder']}": str(record["command"])}
+    lines = apply_commands(record["inputs"], Path(record["inputs"]["out"]))
+    return again | {f"Apply it to {what}": line for what, line in lines.items()}
+
+
+def footer(record: Record) -> str:
+    """Return the last line."""
+    return f"torchdeform {record['versions']['torchdeform']}. The figures are in result.json, too."

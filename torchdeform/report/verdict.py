@@ -1,0 +1,129 @@
+"""The headline of the page: whether a registration went well, in words."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
+_STEADY = 0.01  # a change by less than this share of the value is none
+_EXTREME = 10.0  # times that a volume may change before it is worth a look
+_FAR = 1.0  # voxels that going back and forth may miss
+
+Record = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that speaks for or against a result: ``good``, ``doubtful`` or ``bad``, and a sentence."""
+
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to think of a result: the worst of its findings, a headline, and the findings."""
+
+    kind: str
+    headline: str
+    findings: tuple[Finding, ...]
+
+
+_HEADLINES = {
+    GOOD: "The images fit better than before, and the map does not fold.",
+    DOUBTFUL: "Look at this registration closely before you use it.",
+    BAD: "Do not use this registration as it is.",
+}
+
+
+def judge(record: Record) -> Verdict:
+    """Return what the figures of a record say about a registration.
+
+    Args:
+        record: what `describe` returns, with ``warnings`` where there are some.
+
+    Notes:
+        No figure proves that the right tissue lies on the right tissue; only labels, landmarks and eyes can tell.
+    """
+    found = [_folds(record), _similarity(record), *_labels(record), *_landmarks(record), *_map(record)]
+    found += [Finding(DOUBTFUL, f"Warning: {text}") for text in record.get("warnings", ())]
+    kind = next(kind for kind in (BAD, DOUBTFUL, GOOD) if kind == GOOD or any(f.kind == kind for f in found))
+    order = (BAD, DOUBTFUL, GOOD)
+    return Verdict(kind, _HEADLINES[kind], tuple(sorted(found, key=lambda finding: order.index(finding.kind))))
+
+
+def _folds(record: Record) -> Finding:
+    folds = record["folds"]
+    if folds == 0:
+        return Finding(GOOD, "The map folds nowhere: 0 voxels, by the full certificate of one-sided determinants.")
+    return Finding(BAD, f"The map folds at {folds:,} voxel{'s' if folds > 1 else ''}: it cannot be inverted there.")
+
+
+def _similarity(record: Record) -> Finding:
+    before, after = (value(record[f"similarity_{when}"]) for when in ("before", "after"))
+    if not (math.isfinite(before) and math.isfinite(after)):
+        return Finding(BAD, "The similarity is not a number: the images could not be compared.")
+    change = (after - before) / max(abs(before), abs(after), 1e-12)
+    figures = f"{number(before)} → {number(after)}, higher is better"
+    if abs(change) < _STEADY:
+        return Finding(DOUBTFUL, f"The deformation hardly changed the similarity ({figures}).")
+    if change < 0:
+        return Finding(BAD, f"The images are less similar than before the deformation ({figures}).")
+    return Finding(GOOD, f"The deformation made the images more similar ({figures}).")
+
+
+def _labels(record: Record) -> list[Finding]:
+    before, after = ends(record, "dice_mean")
+    if not math.isfinite(before + after):
+        return []
+    figures = f"mean Dice {number(before)} → {number(after)}"
+    if after < before - _STEADY:
+        return [Finding(BAD, f"The labels overlap less than before ({figures}).")]
+    if after < before + _STEADY:
+        return [Finding(DOUBTFUL, f"The labels overlap no better than before ({figures}).")]
+    return [Finding(GOOD, f"The labels overlap better than before ({figures}; 1 is perfect).")]
+
+
+def _landmarks(record: Record) -> list[Finding]:
+    before, after = ends(record, "landmark_error_mean")
+    if not math.isfinite(before + after):
+        return []
+    figures = f"mean distance {number(before)} → {number(after)} mm"
+    if after > before * (1 + _STEADY):
+        return [Finding(BAD, f"The landmarks lie farther apart than before ({figures}).")]
+    if after > before * (1 - _STEADY):
+        return [Finding(DOUBTFUL, f"The landmarks lie no nearer than before ({figures}).")]
+    return [Finding(GOOD, f"The landmarks lie nearer than before ({figures}).")]
+
+
+def _map(record: Record) -> list[Finding]:
+    """Return what the map itself gives to think about."""
+    found = []
+    low, high, error = (value(record[key]) for key in ("determinant_min", "determinant_max", "inverse_error_max"))
+    if record["folds"] == 0 and (low < 1 / _EXTREME or high > _EXTREME):
+        figures = f"volume × {number(low)} to × {number(high)}"
+        found.append(Finding(DOUBTFUL, f"Somewhere the map changes volumes more than tenfold ({figures})."))
+    if not error < _FAR:
+        figures = f"up to {number(error)} voxels"
+        found.append(Finding(DOUBTFUL, f"Going forth and back misses the start by more than a voxel ({figures})."))
+    return found
+
+
+def ends(record: Record, key: str) -> tuple[float, float]:
+    """Return a measure of labels or landmarks before and after all; NaN where it is not known."""
+    measures = record.get("evaluation", {})
+    before, after = (value(measures.get(stage, {}).get(key)) for stage in ("before", "after"))
+    return before, after
+
+
+def value(figure: float | None) -> float:
+    """Return a figure of a record, NaN where there is none."""
+    return math.nan if figure is None else figure
+
+
+def number(figure: float | None) -> str:
+    """Return a figure with three digits, a dash where there is none."""
+    if not math.isfinite(value(figure)):
+        return "–"
+    return f"{figure:.0f}" if abs(value(figure)) >= 1000 else f"{figure:.3g}"
