@@ -36,11 +36,19 @@ def test_more_takes_more(dim):
         assert estimate(small, similarity=name) < estimate(large, similarity=name)
         assert estimate(small, similarity=name) < estimate(small, channels=3, similarity=name)
     assert estimate(small, similarity="lncc") < estimate(small, similarity={"lncc": 1.0, "mind": 0.5})
+    assert estimate(small, similarity="ssd") < estimate(small, similarity="ssd", start="discrete")
+    assert estimate(small, channels=9, similarity={"lncc": 1.0, "mind": 0.5}) == estimate(
+        small, channels=9, similarity={"lncc": 1.0, "mind": 0.5}, start="discrete"
+    )  # the climb holds more
+    finest = fitting_grid(large, 500_000_000, similarity="ssd", start="discrete")
+    assert estimate(finest, similarity="ssd", start="discrete") <= 500_000_000
 
 
 def test_an_unknown_similarity_is_refused():
     with pytest.raises(InputError, match="similarity must be one of"):
         estimate(Grid((64, 64)), similarity="lnc")
+    with pytest.raises(InputError, match="start must be one of"):
+        estimate(Grid((64, 64)), start="discreet")
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from torchdeform import cli
 from torchdeform.commands.transforms import VERBS
 from torchdeform.image import Image
 from torchdeform.io import read_displacement, read_image, write_displacement, write_image
+from torchdeform.io.labels import read_labels
 from torchdeform.io.points import Points, read_points, write_points
 from torchdeform.io.transforms import read_transform, write_transform
 from torchdeform.transform import Affine, Transform
@@ -94,6 +95,16 @@ def test_labels_keep_values_and_type(folder, out):
     theirs = _resampled("labels.nrrd", "fixed.nrrd", "transform.h5", sitk.sitkNearestNeighbor)
     assert (ours != theirs).mean() <= 2e-3  # points on the border of two voxels
     assert (ours > 0).mean() > 0.2
+
+
+@pytest.mark.parametrize("name", ["nearest", "label"])
+def test_labels_are_those_of_the_class(folder, name):
+    """With `label`, neighbours decide together: among as many values as voxels it is still one of them."""
+    assert run("apply", "transform.h5", "labels.nrrd", "--out", "warped.nrrd", "--interpolation", name) == 0
+    labels, found = read_labels("labels.nrrd"), read_labels("warped.nrrd")
+    assert (found.pixel_type, found.data.dtype) == ("uint32", torch.float64)
+    assert torch.equal(found.data, read_transform("transform.h5").labels(labels, mode=name).data)
+    assert set(found.data.unique().tolist()) <= {0.0, *labels.data.unique().tolist()}
 
 
 def test_apply_takes_the_grid_of_the_transform(folder):

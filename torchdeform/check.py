@@ -265,7 +265,8 @@ def _about_orientation(pair: _Pair) -> Iterator[Finding]:
 def _about_memory(pair: _Pair) -> Iterator[Finding]:
     room = available(pair.fixed.data.device)
     grid = pair.fixed.grid
-    need = estimate(grid, channels=pair.fixed.data.shape[1], similarity=pair.settings.similarity)
+    how = {"channels": pair.fixed.data.shape[1], "similarity": pair.settings.similarity, "start": pair.settings.start}
+    need = estimate(grid, **how)
     if room is None or need < 0.8 * room:
         return
     size = "×".join(map(str, grid.shape[::-1]))

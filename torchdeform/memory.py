@@ -8,10 +8,10 @@ from pathlib import Path
 
 import torch
 
-from torchdeform.errors import InputError
+from torchdeform.errors import InputError, require_choice
 from torchdeform.grid import Grid
 from torchdeform.registration.pyramid import MIN_NODES
-from torchdeform.registration.settings import similarity_weights
+from torchdeform.registration.settings import STARTS, similarity_weights
 
 _UNITS = {"": 1, "k": 1e3, "m": 1e6, "g": 1e9, "t": 1e12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
 _SIZE = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([kmgt]i?)?b?\s*", re.IGNORECASE)
@@ -40,25 +40,35 @@ _PER_CHANNEL = {
     "ngf": {2: 60.0, 3: 20.0},
     "mind": {2: 125.0, 3: 230.0},
 }
+# The same of a discrete start, whatever the similarity: per node, and per node and channel. What holds more counts.
+_DISCRETE = {2: (200.0, 110.0), 3: (270.0, 90.0)}
 
 
-def estimate(grid: Grid, *, channels: int = 1, similarity: str | Mapping[str, float] = "lncc") -> int:
+def estimate(
+    grid: Grid, *, channels: int = 1, similarity: str | Mapping[str, float] = "lncc", start: str = "identity"
+) -> int:
     """Return about how many bytes a process holds at most that registers images on this grid, from files to files.
 
     Args:
         grid: of the fixed image, which the finest level has.
         channels: of the images.
         similarity: one or several, as in `RegistrationSettings`.
+        start: ``identity`` or ``discrete``, likewise.
 
     Raises:
-        InputError: an unknown similarity.
+        InputError: an unknown similarity or start.
 
     Notes:
         Affine in the number of nodes; coarser levels are smaller by 2^D and do not count. Measured in float32 on a CPU,
         within 25 % from 64³ to 160³ and from 512² to 2048².
     """
+    require_choice(start, STARTS, "start")
     per_channel = sum(_PER_CHANNEL[name][grid.dim] for name in similarity_weights(similarity))
-    return round(_PROCESS_BYTES + (_PER_NODE[grid.dim] + channels * per_channel) * math.prod(grid.shape))
+    per_node = _PER_NODE[grid.dim] + channels * per_channel
+    if start == "discrete":
+        node, channel = _DISCRETE[grid.dim]
+        per_node = max(per_node, node + channels * channel)
+    return round(_PROCESS_BYTES + per_node * math.prod(grid.shape))
 
 
 def available(device: torch.device | str = "cpu") -> int | None:
@@ -134,7 +144,14 @@ def readable(size: int, *, spaced: bool = True) -> str:
     return f"{size / 1000**exponent:.3g}{' ' if spaced else ''}{('B', 'kB', 'MB', 'GB', 'TB')[exponent]}"
 
 
-def fitting_grid(grid: Grid, limit: int, *, channels: int = 1, similarity: str | Mapping[str, float] = "lncc") -> Grid:
+def fitting_grid(
+    grid: Grid,
+    limit: int,
+    *,
+    channels: int = 1,
+    similarity: str | Mapping[str, float] = "lncc",
+    start: str = "identity",
+) -> Grid:
     """Return the finest grid of the same box on which a registration takes at most ``limit`` bytes.
 
     Args:
@@ -142,6 +159,7 @@ def fitting_grid(grid: Grid, limit: int, *, channels: int = 1, similarity: str |
         limit: bytes, see `parse_size`.
         channels: of the images.
         similarity: one or several, as in `RegistrationSettings`.
+        start: ``identity`` or ``discrete``, likewise.
 
     Raises:
         InputError: not even the coarsest grid fits.
@@ -151,7 +169,7 @@ def fitting_grid(grid: Grid, limit: int, *, channels: int = 1, similarity: str |
     """
     size = min(grid.spacing)
     coarser = grid
-    while (need := estimate(coarser, channels=channels, similarity=similarity)) > limit:
+    while (need := estimate(coarser, channels=channels, similarity=similarity, start=start)) > limit:
         size /= _SHRINK
         coarser = _with_voxels(grid, size)
         if max(coarser.shape) <= MIN_NODES:

@@ -219,7 +219,7 @@ def _fitted(
     fixed: Image, settings: RegistrationSettings, memory: int | None, device: torch.device
 ) -> tuple[Image, tuple[str, ...]]:
     """Return the fixed image on the finest grid that memory allows, and a sentence if that is a coarser one."""
-    how = {"channels": fixed.data.shape[1], "similarity": settings.similarity}
+    how = {"channels": fixed.data.shape[1], "similarity": settings.similarity, "start": settings.start}
     maps = 2 if settings.symmetric else 1
     need, free = maps * estimate(fixed.grid, **how), available(device)
     if memory is None:

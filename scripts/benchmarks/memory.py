@@ -13,16 +13,18 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# Dimension, voxels along an axis, channels, similarity.
-QUICK = ((2, 512, 1, "lncc"), (3, 64, 1, "lncc"))
+# Dimension, voxels along an axis, channels, similarity, start.
+QUICK = ((2, 512, 1, "lncc", "identity"), (3, 64, 1, "lncc", "identity"), (3, 96, 1, "ssd", "discrete"))
 CASES = (
-    *((2, n, 1, "lncc") for n in (512, 1024, 2048)),
-    *((2, 1024, c, s) for c, s in ((1, "ssd"), (1, "mi"), (1, "ngf"), (1, "mind"), (3, "lncc"))),
-    *((3, n, 1, "lncc") for n in (64, 96, 128, 160)),
-    *((3, 96, c, s) for c, s in ((1, "ssd"), (1, "ncc"), (1, "mi"), (1, "ngf"), (1, "mind"), (3, "lncc"))),
+    *((2, n, 1, "lncc", "identity") for n in (512, 1024, 2048)),
+    *((2, 1024, c, s, "identity") for c, s in ((1, "ssd"), (1, "mi"), (1, "ngf"), (1, "mind"), (3, "lncc"))),
+    *((3, n, 1, "lncc", "identity") for n in (64, 96, 128, 160)),
+    *((3, 96, c, s, "identity") for c, s in ((1, "ssd"), (1, "ncc"), (1, "mi"), (1, "ngf"), (1, "mind"), (3, "lncc"))),
+    *((2, n, 1, "lncc", "discrete") for n in (512, 1024, 1536)),
+    *((3, n, c, s, "discrete") for n, c, s in ((64, 1, "lncc"), (96, 1, "ssd"), (96, 3, "lncc"), (128, 1, "lncc"))),
 )
 
-Case = tuple[int, int, int, str]
+Case = tuple[int, int, int, str, str]
 
 
 def run(case: Case) -> int:
@@ -35,12 +37,13 @@ def run(case: Case) -> int:
     from torchdeform.image import Image
     from torchdeform.io import write_image
 
-    dim, n, channels, similarity = case
+    dim, n, channels, similarity, start = case
     torch.manual_seed(0)
     coarse = torch.rand(1, channels, *[n // 8] * dim)
     mode = {2: "bilinear", 3: "trilinear"}[dim]
     data = torch.nn.functional.interpolate(coarse, size=(n,) * dim, mode=mode)
-    choices = ("--set", "steps=[1, 1, 2]", "--set", f"similarity={similarity}", "--device", "cpu", "--quiet")
+    settings = ("steps=[1, 1, 2]", f"similarity={similarity}", f"start={start}")
+    choices = (*(word for setting in settings for word in ("--set", setting)), "--device", "cpu", "--quiet")
     with tempfile.TemporaryDirectory() as folder:
         names = [Path(folder) / f"{name}.nrrd" for name in ("fixed", "moving")]
         for name, shift in zip(names, (0, 1), strict=True):
@@ -70,8 +73,8 @@ def estimated(case: Case) -> int:
     from torchdeform.grid import Grid
     from torchdeform.memory import estimate
 
-    dim, n, channels, similarity = case
-    return estimate(Grid((n,) * dim), channels=channels, similarity=similarity)
+    dim, n, channels, similarity, start = case
+    return estimate(Grid((n,) * dim), channels=channels, similarity=similarity, start=start)
 
 
 def main() -> None:
@@ -85,7 +88,7 @@ def main() -> None:
         return
     for case in QUICK if arguments.quick else CASES:
         found, expected = measure(case), estimated(case)
-        print(f"{case!s:24} measured {found / 1e6:8.1f} MB  expected {expected / 1e6:8.1f} MB  {expected / found:.2f}")
+        print(f"{case!s:38} measured {found / 1e6:8.1f} MB  expected {expected / 1e6:8.1f} MB  {expected / found:.2f}")
 
 
 if __name__ == "__main__":

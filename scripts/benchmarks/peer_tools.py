@@ -327,19 +327,16 @@ def _convex_adam(job: Job) -> Mapped:
 
     if _dimension(job) != 3:
         raise ValueError("ConvexAdam takes volumes only")
-    matrix = greedy_affine(job, "NCC 2x2x2", 0)
-    to_moving = _world_affine(matrix)
+    to_moving = _world_affine(greedy_affine(job, "NCC 2x2x2", 0))
     fixed, moving = (sitk.ReadImage(name, sitk.sitkFloat32) for name in job.names)
-    aligned = sitk.Resample(moving, fixed, to_moving, sitk.sitkLinear, 0.0)
-    masks = {}
-    if job.masks:
-        both = [sitk.ReadImage(name) for name in job.masks]
-        both[1] = sitk.Resample(both[1], fixed, to_moving, sitk.sitkNearestNeighbor, 0)
-        paths = [_in_array_order(image, job.folder / f"mask{k}.nii") for k, image in enumerate(both)]
-        masks = {"use_mask": True, "path_fixed_mask": paths[0], "path_moving_mask": paths[1]}
-    arrays = (sitk.GetArrayFromImage(image) for image in (fixed, aligned))
+    # With masks it takes even sizes only.
+    frame = sitk.ZeroFluxNeumannPad(fixed, [0] * 3, [n % 2 if job.masks else 0 for n in fixed.GetSize()])
+    aligned = sitk.Resample(moving, frame, to_moving, sitk.sitkLinear, 0.0)
+    arrays = (sitk.GetArrayFromImage(image) for image in (frame, aligned))
     convex = import_module("convexAdam.convex_adam_MIND")
-    found = convex.convex_adam_pt(*arrays, device=torch.device(job.device), dtype=torch.float32, **masks)
+    choices = _convex_adam_masks(job, frame, to_moving)
+    found = convex.convex_adam_pt(*arrays, device=torch.device(job.device), dtype=torch.float32, **choices)
+    found = found[tuple(slice(n) for n in fixed.GetSize()[::-1])]
     np.save(job.folder / "displacement.npy", found)
 
     def positions() -> NDArray[np.float64]:
@@ -348,6 +345,21 @@ def _convex_adam(job: Job) -> Mapped:
         return here @ np.array(to_moving.GetMatrix()).reshape(3, 3).T + to_moving.GetTranslation()
 
     return positions
+
+
+def _convex_adam_masks(job: Job, frame: sitk.Image, to_moving: sitk.AffineTransform) -> dict[str, Any]:
+    """Write both masks on the frame, with the axes of SimpleITK's arrays, and return the choices that name them."""
+    import numpy as np
+    import SimpleITK as sitk
+
+    nibabel, paths = import_module("nibabel"), []
+    if job.masks is None:
+        return {}
+    for k, transform in enumerate((sitk.Transform(3, sitk.sitkIdentity), to_moving)):
+        mask = sitk.Resample(sitk.ReadImage(job.masks[k]), frame, transform, sitk.sitkNearestNeighbor, 0)
+        paths.append(job.folder / f"mask{k}.nii")
+        nibabel.save(nibabel.Nifti1Image(sitk.GetArrayFromImage(mask).astype(np.float32), np.eye(4)), paths[-1])
+    return {"use_mask": True, "path_fixed_mask": paths[0], "path_moving_mask": paths[1]}
 
 
 def _world_affine(path: Path) -> sitk.AffineTransform:
@@ -361,16 +373,6 @@ def _world_affine(path: Path) -> sitk.AffineTransform:
     transform.SetMatrix(matrix[:3, :3].ravel().tolist())
     transform.SetTranslation(matrix[:3, 3].tolist())
     return transform
-
-
-def _in_array_order(image: sitk.Image, path: Path) -> Path:
-    """Write a volume such that nibabel reads it with the axes that SimpleITK's arrays have."""
-    import numpy as np
-    import SimpleITK as sitk
-
-    nibabel = import_module("nibabel")
-    nibabel.save(nibabel.Nifti1Image(sitk.GetArrayFromImage(image).astype(np.float32), np.eye(4)), path)
-    return path
 
 
 def _fireants(job: Job) -> Mapped:

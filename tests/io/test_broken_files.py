@@ -379,6 +379,54 @@ def test_masks_that_cannot_be_used(folder, mask, message):
         preflight(image, image, fixed_mask=mask()).require_ok()
 
 
+def _labels(offset: int = 0, kind: str = "uint8") -> np.ndarray:
+    """Two slabs, labelled 1 and 2 and what is added to them."""
+    values = np.zeros(SHAPE, kind)
+    values[2:4], values[5:7] = 1 + offset, 2 + offset
+    return values
+
+
+def _moved_away(path: Path) -> None:
+    image = _itk(_labels())
+    image.SetOrigin((1e4, 0.0, 0.0))
+    sitk.WriteImage(image, str(path))
+
+
+LABELS: dict[str, tuple[Make, str]] = {
+    "none in common": (lambda p: _save(_labels(7), p), "no label in common"),
+    "nothing": (lambda p: _save(np.zeros(SHAPE, np.uint8), p), "no label in common"),
+    "fractions": (lambda p: _save(_labels(kind="float32") * np.float32(0.5), p), "must hold whole numbers"),
+    "NaN": (lambda p: _save(np.full(SHAPE, np.nan, np.float32), p), "NaN or infinite"),
+    "infinite": (lambda p: _save(np.full(SHAPE, np.inf, np.float32), p), "NaN or infinite"),
+    "a picture": (lambda p: _save(_labels()[3], p), "must be 3D"),
+    "two channels": (lambda p: _save(np.stack([_labels()] * 2, -1), p, vector=True), "one channel"),
+    "cut off": (lambda p: p.write_bytes(_bytes_of(".nii")[:300]), "bad.nii"),
+    "absent": (lambda p: None, "does not exist"),
+}
+
+
+@pytest.mark.parametrize("side", ["fixed", "moving"])
+@pytest.mark.parametrize("wrong", LABELS)
+def test_labels_that_do_not_fit(folder, capfd, wrong, side):
+    """Found out before the registration, by file name."""
+    make, message = LABELS[wrong]
+    make(folder / "bad.nii")
+    _save(_labels(), folder / "good.nii")
+    names = {"fixed": "good.nii", "moving": "good.nii", side: "bad.nii"}
+    options = [word for key, name in names.items() for word in (f"--{key}-labels", name)]
+    said = _refused(folder, capfd, "sound.nii.gz", "sound.nii.gz", *options)
+    assert "bad.nii" in said
+    assert message in said
+
+
+def test_labels_of_one_image_only_or_of_another_place(folder, capfd):
+    _save(_labels(), folder / "good.nii")
+    _moved_away(folder / "bad.nii")
+    assert "--moving-labels" in _refused(folder, capfd, "sound.nii.gz", "sound.nii.gz", "--fixed-labels", "good.nii")
+    options = ["--fixed-labels", "bad.nii", "--moving-labels", "good.nii"]
+    assert "no label in common" in _refused(folder, capfd, "sound.nii.gz", "sound.nii.gz", *options)
+
+
 @pytest.mark.parametrize("name", ["absent_mask.nii.gz", "sound.nii"])
 def test_a_mask_that_is_not_there_is_an_error(folder, name):
     with pytest.raises(InputError, match="does not exist"):

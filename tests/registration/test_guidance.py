@@ -21,7 +21,7 @@ from torchdeform.transform import Affine
 from torchdeform.warp import sample, warp
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
-QUICK = RegistrationSettings(steps=(30, 20, 10), length=6.0, window=7, align="none")
+QUICK = RegistrationSettings(steps=(30, 20, 10), weight_div=1.0, length=6.0, window=7, align="none")
 
 
 def landmarks(truth: Tensor, grid: Grid, count: int = 8) -> tuple[Tensor, Tensor]:

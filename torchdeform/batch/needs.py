@@ -33,5 +33,6 @@ def _need(job: Job, size: tuple[tuple[int, ...], int] | None) -> int:
         return job.memory or 0
     shape, channels = size
     maps = 2 if job.settings.symmetric else 1
-    need = maps * estimate(Grid(shape), channels=channels, similarity=job.settings.similarity)
+    how = {"channels": channels, "similarity": job.settings.similarity, "start": job.settings.start}
+    need = maps * estimate(Grid(shape), **how)
     return need if job.memory is None else min(need, job.memory)

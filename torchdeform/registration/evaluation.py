@@ -148,7 +148,7 @@ def common_labels(
     found = []
     for name, field in zip(names, (fixed, moving), strict=True):
         values = field.unique()
-        if not bool((values == values.round()).all() if values.is_floating_point() else True):
+        if values.is_floating_point() and not bool((values.isfinite() & (values == values.round())).all()):
             raise InputError(f"{name} must hold whole numbers; check that it is the right one")
         found.append({int(v) for v in values.tolist()} - {0})
     if not found[0] & found[1]:

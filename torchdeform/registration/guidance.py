@@ -69,7 +69,7 @@ class Guidance:
                 raise InputError(f"{name} must be an Image, because the images are")
             if field.grid.dim != dim or field.data.shape[1] != 1:
                 kind = f"{field.grid.dim}D with {field.data.shape[1]} channels"
-                raise InputError(f"{name}: {field.name} must be {dim}D with one channel, but is {kind}")
+                raise InputError(f"{name}: {field.name} must be {dim}D with one channel, but is {kind}; choose another")
         if self.fixed_points is not None and tuple(self.fixed_points.shape[:2]) != (1, dim):
             raise InputError(f"fixed_points must have shape (1, {dim}, n), got {tuple(self.fixed_points.shape)}")
 
