@@ -97,6 +97,7 @@ class Journal:
             "device": job.device,
             "memory": job.memory,
             "voxels": job.voxels,
+            "submission": None if job.submission is None else job.submission.name,
             "inputs": inputs,
         }
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
