@@ -10,7 +10,7 @@ import torch
 
 from torchdeform.errors import InputError, require_choice
 from torchdeform.grid import Grid
-from torchdeform.registration.pyramid import MIN_NODES
+from torchdeform.registration.pyramid import MIN_NODES, with_voxels
 from torchdeform.registration.settings import STARTS, similarity_weights
 
 _UNITS = {"": 1, "k": 1e3, "m": 1e6, "g": 1e9, "t": 1e12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
@@ -171,21 +171,10 @@ def fitting_grid(
     coarser = grid
     while (need := estimate(coarser, channels=channels, similarity=similarity, start=start)) > limit:
         size /= _SHRINK
-        coarser = _with_voxels(grid, size)
+        coarser = with_voxels(grid, size)
         if max(coarser.shape) <= MIN_NODES:
             raise InputError(
                 f"--memory {readable(limit, spaced=False)} is too little for any image: give at least "
                 f"{readable(need, spaced=False)}"
             )
     return coarser
-
-
-def _with_voxels(grid: Grid, size: float) -> Grid:
-    """Return the grid of the same box whose voxels are at least about ``size`` wide."""
-    shape = tuple(
-        n if h >= size else min(n, max(MIN_NODES, round(side / size) + 1))
-        for n, h, side in zip(grid.shape, grid.spacing, grid.extent, strict=True)
-    )
-    if shape == grid.shape:
-        return grid
-    return Grid(shape, tuple(side / (n - 1) for side, n in zip(grid.extent, shape, strict=True)))

@@ -13,8 +13,9 @@ from torchdeform.grid import Grid
 from torchdeform.image import Image, luminance, require_registrable, resample
 from torchdeform.registration.affine_detail import DetailCorrelation
 from torchdeform.registration.affine_group import generators
-from torchdeform.registration.affine_level import Frame, Level, Masked, coarse_grid
+from torchdeform.registration.affine_level import Frame, Level, Masked
 from torchdeform.registration.affine_search import Candidate, Found, climbed, search
+from torchdeform.registration.pyramid import with_voxels
 from torchdeform.registration.settings import ALIGNMENTS, similarity_weights
 from torchdeform.registration.similarity import Similarity, features, make_similarity, on_one_scale
 from torchdeform.transform import Affine
@@ -293,7 +294,7 @@ def _levels(fixed: Masked, moving: Masked, frame: Frame, settings: AlignmentSett
     ``size`` is how much larger things are in the moving image: voxels larger by as much blur both images alike.
     """
     voxel = min(fixed.image.grid.spacing)
-    while math.prod(coarse_grid(fixed.image.grid, voxel).shape) > settings.nodes_in(fixed.image.grid.dim):
+    while math.prod(with_voxels(fixed.image.grid, voxel).shape) > settings.nodes_in(fixed.image.grid.dim):
         voxel *= _FINER
     levels = []
     while True:
@@ -301,7 +302,7 @@ def _levels(fixed: Masked, moving: Masked, frame: Frame, settings: AlignmentSett
         levels.insert(0, _level(fixed, moving, frame, settings))
         voxel *= 2
         shape = fixed.image.grid.shape
-        if math.prod(shape) <= _COARSEST or coarse_grid(fixed.image.grid, voxel).shape == shape:
+        if math.prod(shape) <= _COARSEST or with_voxels(fixed.image.grid, voxel).shape == shape:
             return levels
 
 

@@ -11,7 +11,7 @@ from torchdeform.grid import Grid
 from torchdeform.image import Image
 from torchdeform.registration.affine_group import homogeneous
 from torchdeform.registration.metrics.boxes import box_sum
-from torchdeform.registration.pyramid import MIN_NODES, restrict
+from torchdeform.registration.pyramid import restrict, with_voxels
 from torchdeform.registration.similarity import Similarity
 from torchdeform.stencil import derivative
 from torchdeform.warp import sample
@@ -41,7 +41,7 @@ class Masked:
     def coarser(self, voxel: float) -> "Masked":
         """Return both at voxels of about this width, smoothed so that nothing aliases; thicker voxels stay."""
         grid = self.image.grid
-        coarse = coarse_grid(grid, voxel)
+        coarse = with_voxels(grid, voxel)
         weight = None if self.weight is None else restrict(self.weight, grid, coarse)
         return Masked(replace(self.image, data=restrict(self.image.data, grid, coarse), grid=coarse), weight)
 
@@ -69,15 +69,6 @@ class Masked:
         origin = tuple(self.image.to_world(corner.view(1, -1, 1)).flatten().tolist())
         image = replace(self.image, data=self.image.data[cut], grid=Grid(shape, grid.spacing), origin=origin)
         return Masked(image, self.weight[cut])
-
-
-def coarse_grid(grid: Grid, voxel: float) -> Grid:
-    """Return the grid of the same box with voxels of about this width, at least 8 nodes an axis where there are."""
-    shape = tuple(
-        n if h >= voxel else min(n, max(MIN_NODES, round(side / voxel) + 1))
-        for n, h, side in zip(grid.shape, grid.spacing, grid.extent, strict=True)
-    )
-    return Grid(shape, tuple(side / (n - 1) for side, n in zip(grid.extent, shape, strict=True)))
 
 
 @dataclass(frozen=True)

@@ -43,9 +43,13 @@ def pyramid_grids(grid: Grid, levels: int) -> list[Grid]:
 
 def thinned(grid: Grid, times: float) -> Grid:
     """Return the grid of the same box whose voxels are about so many times as wide as the narrowest of ``grid``."""
-    target = min(grid.spacing) * times
+    return with_voxels(grid, min(grid.spacing) * times)
+
+
+def with_voxels(grid: Grid, width: float) -> Grid:
+    """Return the grid of the same box with voxels of about this width, at least 8 nodes an axis where there are."""
     shape = tuple(
-        n if h >= target else min(n, max(MIN_NODES, round(side / target) + 1))
+        n if h >= width else min(n, max(MIN_NODES, round(side / width) + 1))
         for n, h, side in zip(grid.shape, grid.spacing, grid.extent, strict=True)
     )
     if shape == grid.shape:

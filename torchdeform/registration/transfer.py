@@ -41,26 +41,50 @@ class Transfer:
         return _products(force, self._downs)
 
     @cached_property
-    def _ups(self) -> list[Tensor]:
-        return [self._matrix(axis) for axis in range(self.fine.dim)]
+    def _ups(self) -> list["_Along | None"]:
+        return [_along(matrix) for matrix in self._matrices()]
 
     @cached_property
-    def _downs(self) -> list[Tensor]:
+    def _downs(self) -> list["_Along | None"]:
         ratios = [h / wide for h, wide in zip(self.fine.spacing, self.coarse.spacing, strict=True)]
-        return [(matrix.T * ratio).contiguous() for matrix, ratio in zip(self._ups, ratios, strict=True)]
+        return [_along(matrix.T * ratio) for matrix, ratio in zip(self._matrices(), ratios, strict=True)]
 
-    def _matrix(self, axis: int) -> Tensor:
-        """Return the matrix of linear interpolation along an axis ``(fine, coarse)``."""
-        hats = torch.eye(self.coarse.shape[axis], dtype=self.like.dtype, device=self.like.device).unsqueeze(0)
-        return F.interpolate(hats, size=self.fine.shape[axis], mode="linear", align_corners=True)[0].T.contiguous()
+    def _matrices(self) -> list[Tensor]:
+        """Return the matrix of linear interpolation along each axis ``(fine, coarse)``."""
+        matrices = []
+        for size, nodes in zip(self.fine.shape, self.coarse.shape, strict=True):
+            hats = torch.eye(nodes, dtype=self.like.dtype, device=self.like.device).unsqueeze(0)
+            matrices.append(F.interpolate(hats, size=size, mode="linear", align_corners=True)[0].T)
+        return matrices
 
 
-def _products(field: Tensor, matrices: Sequence[Tensor]) -> Tensor:
+@dataclass(frozen=True)
+class _Band:
+    """The entries of a matrix that has few in each row: their values and columns ``(rows, width)``."""
+
+    values: Tensor
+    columns: Tensor
+
+
+_Along = Tensor | _Band
+
+
+def _along(matrix: Tensor) -> _Along | None:
+    """Return a matrix as it is multiplied along an axis; None where both grids have the same nodes."""
+    if matrix.shape[0] == matrix.shape[1]:
+        return None
+    if max(matrix.shape) <= _DENSE_LIMIT:
+        return matrix.contiguous()
+    return _Band(*matrix.topk(int((matrix != 0).sum(1).amax()), dim=1))
+
+
+def _products(field: Tensor, factors: Sequence[_Along | None]) -> Tensor:
     """Multiply along every axis."""
-    for axis, matrix in enumerate(matrices, start=2):
-        if matrix.shape[0] != matrix.shape[1]:
-            product = _dense_product if max(matrix.shape) <= _DENSE_LIMIT else _band_product
-            field = product(field, matrix, axis)
+    for axis, factor in enumerate(factors, start=2):
+        if isinstance(factor, _Band):
+            field = _band_product(field, factor, axis)
+        elif factor is not None:
+            field = _dense_product(field, factor, axis)
     return field
 
 
@@ -71,10 +95,9 @@ def _dense_product(field: Tensor, matrix: Tensor, axis: int) -> Tensor:
     return (matrix @ field.flatten(axis + 1)).view(shape)
 
 
-def _band_product(field: Tensor, matrix: Tensor, axis: int) -> Tensor:
-    """Multiply by a matrix with few entries in each row: the same order of summation in every run."""
-    width = int((matrix != 0).sum(1).amax())
-    weights, nodes = matrix.topk(width, dim=1)
+def _band_product(field: Tensor, band: _Band, axis: int) -> Tensor:
+    """Take the entries of each row one by one: the same order of summation in every run."""
     rest = [1] * (field.dim() - 1 - axis)
-    terms = (field.index_select(axis, nodes[:, k]) * weights[:, k].view(-1, *rest) for k in range(width))
+    entries = zip(band.values.unbind(1), band.columns.unbind(1), strict=True)
+    terms = (field.index_select(axis, columns) * values.view(-1, *rest) for values, columns in entries)
     return sum(terms, start=field.new_zeros(()))
