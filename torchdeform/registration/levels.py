@@ -171,7 +171,8 @@ def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> 
         v = _velocity(level, warped, gradient, divergence, pull)
         pace = step_length(settings, step, steps) / level.sides
         move = v * column((_pace(pace, v, pull, level) * active).repeat(level.sides), v)
-        u, lowest, moved, short = advance((u, lowest), move, level.grid, settings.min_determinant, level.sides)
+        share = (settings.elasticity * active).repeat(level.sides)
+        u, lowest, moved, short = advance((u, lowest), move, share, level.grid, settings.min_determinant, level.sides)
         active &= moved
         shortened += short
     return best, LevelRecord(level.comparison.grid.shape, tuple(values), shortened, perf_counter() - start)
@@ -179,7 +180,7 @@ def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> 
 
 def _steps(level: _Level, steps: int) -> int:
     """Return the steps of a level: a coarser map has less to find, in as many times fewer steps."""
-    return steps if level.transfer is None else math.ceil(steps / level.settings.map_spacing)
+    return steps if level.transfer is None else math.ceil(steps / level.settings.map_spacing**2)
 
 
 def _stalled(tops: list[Tensor], tolerance: float) -> Tensor:

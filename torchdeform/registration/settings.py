@@ -50,6 +50,8 @@ class RegistrationSettings:
         weight_curl: price w_c of a rotation.
         length: range √(w_d / w_0) of the metric in voxels of each level's map; longer makes the velocity smoother. One
             number, or one for each level, coarse to fine: the last is for the finest, the first for all not named.
+        elasticity: share of the way to the mean of its neighbours, 0 to 1, that the displacement of every node of the map
+            is taken in every step: `length` smooths each step, this the whole; larger is smoother.
         power: 1, or 2 for a smoother velocity, see `TransformSolver.solve`.
         steps: steps at most on each pyramid level, coarse to fine; its length is the number of levels (a level that
             would leave fewer than 16 nodes on every axis is dropped).
@@ -72,9 +74,10 @@ class RegistrationSettings:
     start: str = "identity"
     similarity: str | Mapping[str, float] = "lncc"
     window: int = 9
-    weight_div: float = 0.3
+    weight_div: float = 0.5
     weight_curl: float = 1.0
-    length: float | tuple[float, ...] = 8.0
+    length: float | tuple[float, ...] = 3.0
+    elasticity: float = 0.1
     power: int = 1
     steps: tuple[int, ...] = (60, 60, 60)
     step_length: float = 0.5
@@ -104,6 +107,8 @@ class RegistrationSettings:
         for name in ("weight_div", "weight_curl", "step_length"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be positive and finite, got {getattr(self, name)}")
+        if not 0 <= self.elasticity <= 1:
+            raise InputError(f"elasticity must lie between 0 and 1, got {self.elasticity}")
         if not 1 <= self.map_spacing <= 8:
             raise InputError(f"map_spacing must lie between 1 and 8 voxels, got {self.map_spacing}")
         for name in ("soft_determinant", "tolerance", "points_weight"):

@@ -14,7 +14,6 @@ from torchdeform.warp import compose
 # Rounds of smoothing that a few folded nodes are given to open.
 _SMOOTHINGS = 100
 
-_MEAN = {2: F.avg_pool2d, 3: F.avg_pool3d}
 _WIDEN = {2: F.max_pool2d, 3: F.max_pool3d}
 
 # A step that is still too bold at this fraction of itself is not taken.
@@ -22,9 +21,9 @@ _SHORTEST = 2.0**-6
 
 
 def advance(
-    state: tuple[Tensor, Tensor], move: Tensor, grid: Grid, limit: float, sides: int = 1
+    state: tuple[Tensor, Tensor], move: Tensor, share: Tensor, grid: Grid, limit: float, sides: int = 1
 ) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Return u ∘ flow(move), its `lowest_determinant`, which pairs moved, and how often a step was halved.
+    """Return u ∘ flow(move), relaxed, its `lowest_determinant`, which pairs moved, and how often a step was halved.
 
     No determinant falls below ``limit``, or below the smallest one there was if that was less. Along the halvings the
     trial tends to u, so a bold step ends as a short one.
@@ -32,6 +31,7 @@ def advance(
     Args:
         state: u ``(sides·B, D, *S)`` in units of spacing, and its `lowest_determinant`.
         move: velocity, the same shape.
+        share: of the way to its `neighbour_mean` that the new u is taken, for each map ``(sides·B,)``, see `relaxed`.
         grid: the grid of both.
         limit: smallest one-sided determinant that may be left.
         sides: maps of one pair, B items apart; they are shortened together.
@@ -41,6 +41,7 @@ def advance(
     fraction, halved = torch.ones_like(floor), 0
     while True:
         trial = compose(u, integrate(move * column(fraction, u), grid, steps=1, method="midpoint"), grid)
+        trial = relaxed(trial, share * fraction, grid)
         trial_lowest = lowest_determinant(trial, grid)
         low = _any_side(~(trial_lowest.flatten(1).amin(1) >= floor), sides)
         count = int(low.sum()) // sides
@@ -87,17 +88,34 @@ def mended(u: Tensor, grid: Grid, limit: float = 0.0) -> Tensor:
         low = ~(lowest_determinant(u, grid) > limit)
         if not bool(low.any()):
             return u
-        near = _window_mean(_WIDEN[grid.dim](low.to(u.dtype), 3, stride=1, padding=1))
-        u = _keep_faces(torch.lerp(u, _window_mean(u), near), u, grid)
+        near = neighbour_mean(_WIDEN[grid.dim](low.to(u.dtype), 3, stride=1, padding=1))
+        u = _keep_faces(torch.lerp(u, neighbour_mean(u), near), u, grid)
     while bool((low := ~(lowest_determinant(u, grid).flatten(1).amin(1) > 0)).any()):
         u = torch.where(column(low, u), 0.9 * u, u)
     return u
 
 
-def _window_mean(field: Tensor) -> Tensor:
-    """Return the mean over every node and its neighbours, the field being continued by its boundary values."""
-    dim = field.dim() - 2
-    return _MEAN[dim](F.pad(field, (1, 1) * dim, mode="replicate"), 3, stride=1)
+def relaxed(u: Tensor, share: Tensor, grid: Grid) -> Tensor:
+    """Return u + share (ū − u), ū being its `neighbour_mean`: diffusion ∂u/∂t = Δu for share / 4 squared voxels.
+
+    A step down the elastic energy ½ ∫ |∇u|², which prices the whole displacement as the metric prices the velocity.
+
+    Args:
+        u: displacement ``(B, D, *S)``; on the faces of the box the components that lead out of it stay as they are.
+        share: 0 to 1 for each item ``(B,)``.
+        grid: its grid.
+    """
+    return _keep_faces(torch.lerp(u, neighbour_mean(u), column(share, u)), u, grid) if bool(share.any()) else u
+
+
+def neighbour_mean(field: Tensor) -> Tensor:
+    """Return the mean with weights 1, 2, 1 along every axis, the field being mirrored at its first and last nodes."""
+    for axis in range(2, field.dim()):
+        count = field.shape[axis]
+        ends = field.narrow(axis, 1, 1), field.narrow(axis, count - 2, 1)
+        wide = torch.cat([ends[0], field, ends[1]], dim=axis)
+        field = (wide.narrow(axis, 0, count) + wide.narrow(axis, 2, count)) / 4 + field / 2
+    return field
 
 
 def _keep_faces(u: Tensor, before: Tensor, grid: Grid) -> Tensor:
