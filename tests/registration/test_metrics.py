@@ -114,6 +114,29 @@ def test_gradgradcheck(name):
     assert torch.autograd.gradgradcheck(lambda w: ON_UNIT[name](fixed, w), (warped.requires_grad_(),))
 
 
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("stride", [2, 3])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_lncc_with_a_stride_has_its_derivative_too(shape, stride, masked):
+    fixed, warped = images(shape, channels=2)
+    mask = soft_mask(shape) if masked else None
+    expected = lncc(fixed, warped.requires_grad_(True), mask=mask, window=7, stride=stride, span=UNIT)
+    (slope,) = torch.autograd.grad(expected.sum(), warped)
+    value, found = LocalCrossCorrelation(fixed, 7, stride).evaluate(warped.detach(), mask)
+    torch.testing.assert_close(value, expected.detach(), rtol=1e-8, atol=1e-9)
+    torch.testing.assert_close(found, slope * warped[0].numel(), rtol=1e-7, atol=1e-8)
+
+
+def test_lncc_sees_that_its_mask_was_written_to():
+    fixed, warped = images((11, 14))
+    mask, other = soft_mask((11, 14)), soft_mask((11, 14), seed=6)
+    similarity = LocalCrossCorrelation(fixed, 5)
+    similarity.evaluate(warped, mask)
+    mask.copy_(other)
+    for found, expected in zip(similarity.evaluate(warped, mask), similarity.evaluate(warped, other), strict=True):
+        assert torch.equal(found, expected)
+
+
 def test_the_derivative_of_gradient_fields_knows_the_spacing():
     grid = Grid((7, 9, 8), (0.7, 1.1, 2.5))
     fixed, warped = images(grid.shape)

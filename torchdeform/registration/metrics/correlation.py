@@ -1,5 +1,6 @@
 """Normalised cross-correlation, of whole images and of the windows around each voxel."""
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -15,7 +16,7 @@ from torchdeform.registration.metrics.base import (
     relative_weight,
     times,
 )
-from torchdeform.registration.metrics.boxes import box_sum
+from torchdeform.registration.metrics.boxes import box_spread, box_sum, centres
 
 # Added to both variances of LNCC, for images scaled to [0, 1]: windows flatter than a grey level of 0.3 % are flat.
 LNCC_FLOOR = 1e-5
@@ -86,52 +87,82 @@ def _centred(image: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:
     return image, channel_mean(image * image, weight) + NCC_FLOOR
 
 
+@dataclass(frozen=True)
+class _Windows:
+    """What is known of the windows before anything is warped, one number for each window ``(B, C or 1, *W)``.
+
+    Attributes:
+        weight: of the voxels ``(B or 1, 1, *S)``, 1 on average; None for 1 everywhere.
+        own: weight of a window, that of the voxel in its middle, 1 on average; None for 1 everywhere.
+        share: 1 / weight of its voxels.
+        mean: of the fixed image in it.
+        variance: of the fixed image in it, + ε.
+    """
+
+    weight: Tensor | None
+    own: Tensor | None
+    share: Tensor
+    mean: Tensor
+    variance: Tensor
+
+
 class LocalCrossCorrelation(Similarity):
     """S = mean over x of c² / ((v_f + ε)(v_w + ε)), covariance and variances in the window around x.
 
     Args:
         fixed: ``(B, C, *S)``, scaled to about [0, 1].
         window: width in voxels, odd. At the boundary the part of the window inside the image counts.
+        stride: voxels from one x to the next along every axis.
 
     Notes:
         Lies in [0, 1]. With a = 2c/((v_f + ε)(v_w + ε)), b = a c/(v_w + ε) and E the mean over a window, the
         derivative by warped(y) is Σ [a (fixed(y) − E fixed) − b (warped(y) − E warped)] over the windows that hold y,
         each divided by its number of voxels. ε = 1e-5 keeps flat regions finite: they count as not correlated.
         A mask weights the voxels of a window and the windows: E becomes the weighted mean.
-        Two sets of box sums a call, of 3 and of 4 fields (6 and 4 with a mask); no window is visited voxel by voxel.
+        Box sums of 3 fields and the transpose of 3 a call; 3 more for a mask that is not the one of the call before.
+        Windows that overlap by half say the same: with stride 2 all in between is an eighth in 3D, and maps are as good.
+        Not differentiable, see `lncc`.
     """
 
-    def __init__(self, fixed: Tensor, window: int = 9) -> None:
-        self.fixed, self.window = at_least_float32(fixed), window
+    def __init__(self, fixed: Tensor, window: int = 9, stride: int = 1) -> None:
+        self.fixed, self.window, self.stride = at_least_float32(fixed), window, stride
+        self._last: tuple[Tensor | None, int, _Windows] | None = None
 
-    @cached_property
-    def _whole(self) -> tuple[Tensor, Tensor, Tensor]:
-        return self._around(None)
+    def _windows(self, mask: Tensor | None, warped: Tensor) -> _Windows:
+        """Return what depends on the mask only; kept for the next call, in which it is often the same."""
+        version = 0 if mask is None or mask.is_inference() else mask._version
+        if self._last is None or self._last[0] is not mask or self._last[1] != version:
+            windows = _windows(self.fixed, relative_weight(mask, warped), self.window, self.stride)
+            self._last = mask, version, windows
+        return self._last[2]
 
-    def _around(self, weight: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return 1 / weight of the window, mean and variance + ε of the fixed image in it."""
-        share = _share(self.fixed, weight, self.window)
-        return share, *_moments(self.fixed, weight, share, self.window)
-
+    @torch.no_grad()
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         warped = at_least_float32(warped)
-        weight = relative_weight(mask, warped)
-        share, fixed_mean, fixed_variance = self._whole if weight is None else self._around(weight)
-        weighted = times(warped, weight)
-        sums = box_sum(torch.cat([weighted, weighted * warped, weighted * self.fixed], dim=1), self.window)
-        warped_mean, square, product = sums.mul_(share).chunk(3, dim=1)
-        covariance = product.sub_(warped_mean * fixed_mean)
-        variance = square.sub_(warped_mean * warped_mean).clamp_(min=0).add_(LNCC_FLOOR)
-        correlation = covariance / (variance * fixed_variance)
-        value = mean(correlation * covariance, weight)
-        a = times(correlation, weight).mul_(2 * share)
+        around = self._windows(mask, warped)
+        sums = box_sum(_products(warped, self.fixed, around.weight), self.window, self.stride).mul_(around.share)
+        warped_mean, square, product = sums.chunk(3, dim=1)
+        covariance = product.addcmul_(warped_mean, around.mean, value=-1)
+        variance = square.addcmul_(warped_mean, warped_mean, value=-1).clamp_(min=0).add_(LNCC_FLOOR)
+        correlation = times(covariance / (variance * around.variance), around.own)
+        value = mean(correlation * covariance)
+        a = correlation.mul_(around.share * (2 * warped[0, 0].numel() / correlation[0, 0].numel()))
         b = a * covariance / variance
-        back = box_sum(torch.cat([a, a * fixed_mean, b, b * warped_mean], dim=1), self.window)
-        a, a_mean, b, b_mean = back.chunk(4, dim=1)
-        return value, times(self.fixed * a - a_mean - warped * b + b_mean, weight)
+        back = torch.cat([a, b, b * warped_mean - a * around.mean], dim=1)
+        a, b, rest = box_spread(back, self.window, self.stride, tuple(warped.shape[2:])).chunk(3, dim=1)
+        slope = torch.addcmul(rest, self.fixed, a).addcmul_(warped, b, value=-1)
+        return value, slope if around.weight is None else slope.mul_(around.weight)
 
 
-def lncc(fixed: Tensor, warped: Tensor, *, mask: Tensor | None = None, window: int = 9, span: Span = None) -> Tensor:
+def lncc(
+    fixed: Tensor,
+    warped: Tensor,
+    *,
+    mask: Tensor | None = None,
+    window: int = 9,
+    span: Span = None,
+    stride: int = 1,
+) -> Tensor:
     """Return S = mean over x of c² / ((v_f + ε)(v_w + ε)), covariance and variances in the window around x.
 
     Args:
@@ -141,6 +172,7 @@ def lncc(fixed: Tensor, warped: Tensor, *, mask: Tensor | None = None, window: i
         window: width in voxels, odd. At the boundary the part of the window inside the image counts.
         span: intensities taken for 0 and 1, which gives ε = 1e-5 its meaning; None: the smallest and the largest of
             each image where the mask is positive.
+        stride: voxels from one x to the next along every axis.
 
     Returns:
         ``(B,)`` between 0 and 1. Flat windows give 0.
@@ -152,21 +184,35 @@ def lncc(fixed: Tensor, warped: Tensor, *, mask: Tensor | None = None, window: i
         Differentiable. `LocalCrossCorrelation` has the derivative in closed form.
     """
     fixed, warped = on_unit_scale(fixed, warped, mask, span)
-    weight = relative_weight(mask, warped)
-    share = _share(fixed, weight, window)
-    fixed_mean, fixed_variance = _moments(fixed, weight, share, window)
-    warped_mean, variance = _moments(warped, weight, share, window)
-    covariance = box_sum(times(fixed * warped, weight), window) * share - fixed_mean * warped_mean
-    return mean(covariance.square() / (fixed_variance * variance), weight)
+    around = _windows(fixed, relative_weight(mask, warped), window, stride)
+    warped_mean, variance = _moments(warped, around.weight, around.share, window, stride)
+    product = box_sum(times(fixed * warped, around.weight), window, stride) * around.share
+    covariance = product - around.mean * warped_mean
+    return mean(covariance.square() / (around.variance * variance), around.own)
 
 
-def _share(image: Tensor, weight: Tensor | None, window: int) -> Tensor:
-    weight = image.new_ones(1, 1, *image.shape[2:]) if weight is None else weight
-    return 1 / box_sum(weight, window).clamp(min=_EMPTY)
+def _windows(fixed: Tensor, weight: Tensor | None, window: int, stride: int) -> _Windows:
+    ones = fixed.new_ones(1, 1, *fixed.shape[2:]) if weight is None else weight
+    share = 1 / box_sum(ones, window, stride).clamp(min=_EMPTY)
+    own = None if weight is None else relative_weight(middle := centres(weight, stride), middle)
+    return _Windows(weight, own, share, *_moments(fixed, weight, share, window, stride))
 
 
-def _moments(image: Tensor, weight: Tensor | None, share: Tensor, window: int) -> tuple[Tensor, Tensor]:
+def _moments(image: Tensor, weight: Tensor | None, share: Tensor, window: int, stride: int) -> tuple[Tensor, Tensor]:
     """Return mean and variance + ε in the window around each voxel."""
     weighted = times(image, weight)
-    first, square = (box_sum(torch.cat([weighted, weighted * image], dim=1), window) * share).chunk(2, dim=1)
+    first, square = (box_sum(torch.cat([weighted, weighted * image], dim=1), window, stride) * share).chunk(2, dim=1)
     return first, (square - first * first).clamp(min=0) + LNCC_FLOOR
+
+
+def _products(warped: Tensor, fixed: Tensor, weight: Tensor | None) -> Tensor:
+    """Return weight · warped, weight · warped² and weight · warped · fixed side by side; no memory but theirs."""
+    items, channels, *shape = warped.shape
+    fields = warped.new_empty(items, 3 * channels, *shape)
+    weighted, square, product = fields.chunk(3, dim=1)
+    weighted.copy_(warped)
+    if weight is not None:
+        weighted.mul_(weight)
+    torch.mul(weighted, warped, out=square)
+    torch.mul(weighted, fixed, out=product)
+    return fields
