@@ -88,15 +88,22 @@ def resample(
         outside: value outside the moving image (ITK's resampler uses 0); None continues its edge.
 
     Returns:
-        ``(1, C, *S)`` on the fixed grid.
+        ``(1, C, *S)`` on the fixed grid; the moving pixels themselves where both images have one grid and one place.
 
     Notes:
         One interpolation only. Coordinates are computed in float64, so far-away origins lose nothing.
     """
+    if u is None and same_place(moving, fixed):
+        return moving.data
     points = fixed.grid.points(dtype=torch.float64, device=moving.data.device)
     if u is not None:
         points = points + u
     return sample(moving.data, moving.to_grid(fixed.to_world(points)), moving.grid, mode=mode, outside=outside)
+
+
+def same_place(a: Image, b: Image) -> bool:
+    """Return whether both images have the same nodes in the world."""
+    return (a.grid, a.origin, a.direction) == (b.grid, b.origin, b.direction)
 
 
 def luminance(image: Image) -> Image:

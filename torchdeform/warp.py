@@ -100,10 +100,11 @@ def _normalise(start: Sequence[Tensor | float], moved: Tensor, grid: Grid) -> Te
 
 def _inside(points: Tensor, grid: Grid) -> Tensor:
     """Return ``(B, 1, *T)``, True where the nearest node, were the grid continued, belongs to the grid (as in ITK)."""
-    column = (1, grid.dim, *([1] * (points.dim() - 2)))
-    index = points / grid.along(grid.spacing, points).view(column)
-    stop = grid.along(grid.shape, points).view(column) - 0.5
-    return ((index >= -0.5) & (index < stop)).all(dim=1, keepdim=True)
+    inside = torch.ones((), dtype=torch.bool, device=points.device)
+    for k, (n, h) in enumerate(zip(grid.shape, grid.spacing, strict=True)):
+        index = points[:, k : k + 1] / h
+        inside = inside & (index >= -0.5) & (index < n - 0.5)
+    return inside
 
 
 def _sample(image: Tensor, normalised: Tensor, mode: str) -> Tensor:

@@ -162,7 +162,8 @@ def align(
         if abs(math.log(found.size)) > math.log(_SAME_SIZE):
             levels = _levels(*pair, frame, settings, found.size)
         best = _descend(levels, [*found.candidates, still], kind, settings)
-    before, best = _valued(levels[-1], still), _valued(levels[-1], best)
+    before = _valued(levels[-1], still)
+    best = before if kind == "none" else best
     if best.value <= before.value:
         best = before
     return Alignment(
@@ -206,7 +207,7 @@ def _descend(levels: list[Level], candidates: list[Candidate], kind: str, settin
         if index == 1 or not candidates:
             candidates = [*candidates, still]
         if index >= _CONTEST:
-            candidates = [max((_valued(level, c) for c in candidates), key=lambda c: c.value)]
+            candidates = candidates[:1]  # the most similar on the level before
         candidates = [c for c in climbed(level, candidates, moves, settings.steps) if c.value > -math.inf]
     if not candidates:
         raise ComputationError(
@@ -275,9 +276,8 @@ def _range(part: Masked) -> tuple[float, float]:
     """Return the 0.5 and 99.5 percentiles of what counts, or its extremes where these are equal."""
     values = part.image.data if part.weight is None else part.image.data[part.weight > 0]
     values = values.flatten()
-    values = values[:: max(1, len(values) // 2**18)].sort().values
-    last = len(values) - 1
-    low, high = values[round(0.005 * last)], values[round(0.995 * last)]
+    values = values[:: max(1, len(values) // 2**18)]
+    low, high = (values.kthvalue(1 + round(share * (len(values) - 1))).values for share in (0.005, 0.995))
     if high <= low:
         low, high = part.image.data.min(), part.image.data.max()
     return float(low), float(high)

@@ -66,7 +66,8 @@ def climb(hill: Hill, maps: Tensor, moves: Tensor, *, steps: int) -> tuple[Tenso
         if not bool(active.any()):
             break
         trial = state.maps @ exponential(step, moves)
-        value, slope = hill.evaluate(trial)
+        value, slope = torch.full_like(state.value, -torch.inf), torch.zeros_like(slope)
+        value[active], slope[active] = hill.evaluate(trial[active])
         better = active & (value > state.value)
         state = _advance(state, better, (trial, value, _project(slope, flat)), step)
         fraction = torch.where(better, 1.0, fraction / 3)

@@ -11,8 +11,9 @@ from torchdeform.registration.affine_group import angle, generators
 from torchdeform.registration.affine_level import Level
 from torchdeform.registration.affine_starts import Start, body, make_starts
 
-# Starts that are climbed, and those of them that go on to the next level.
+# Starts that are climbed, mirrored ones among them, and those that go on to the next level.
 _CLIMBED = 10
+_MIRRORED = 3
 _KEPT = 3
 
 # Maps nearer to each other than this (norm of the difference of their matrices) count as one.
@@ -92,15 +93,16 @@ def search(level: Level, kind: str, *, turn: bool, steps: int) -> Found:
     """
     rough = "similarity" if kind == "affine" else kind
     bodies = body(level.fixed, level.frame), body(level.moving, level.frame)
-    plain, chance = _try(level, make_starts(*bodies, turn=turn, scale=rough == "similarity"), rough, steps)
+    plain, chance = _try(level, make_starts(*bodies, turn=turn, scale=rough == "similarity"), rough, steps, _CLIMBED)
     if not turn or not plain:
         return Found(_best(plain, chance))
-    mirrored, _ = _try(level, make_starts(*bodies, turn=True, scale=rough == "similarity", mirror=True), rough, steps)
+    flipped = make_starts(*bodies, turn=True, scale=rough == "similarity", mirror=True)
+    mirrored, _ = _try(level, flipped, rough, steps, _MIRRORED)
     tops = [max((c.value - chance for c in side), default=0.0) for side in (mirrored, plain)]
     return Found(_best(plain, chance), tops[0] / max(tops[1], 1e-12))
 
 
-def _try(level: Level, starts: list[Start], kind: str, steps: int) -> tuple[list[Candidate], float]:
+def _try(level: Level, starts: list[Start], kind: str, steps: int, most: int) -> tuple[list[Candidate], float]:
     """Return where the most promising starts lead, their merit as value plus what chance gives, and that."""
     maps = torch.stack([start.map for start in starts])
     value, shared = level.values(maps)
@@ -109,19 +111,19 @@ def _try(level: Level, starts: list[Start], kind: str, steps: int) -> tuple[list
         return [], 0.0
     chance = float(value[finite].median())
     merit = (value - chance) * shared.clamp(max=1.0)
-    chosen = _promising(starts, maps, merit)
+    chosen = _promising(starts, maps, merit, most)
     ends = climbed(level, [Candidate(starts[i].name, maps[i], 0.0) for i in chosen], generators(kind, level.dim), steps)
     value, shared = level.values(torch.stack([c.map for c in ends]))
     merit = chance + (value - chance) * shared.clamp(max=1.0)
     return [replace(c, value=float(m)) for c, m in zip(ends, merit, strict=True)], chance
 
 
-def _promising(starts: list[Start], maps: Tensor, merit: Tensor) -> list[int]:
+def _promising(starts: list[Start], maps: Tensor, merit: Tensor, most: int) -> list[int]:
     """Return the starts to climb: all without a rotation, then the best of the others that are not alike."""
     chosen = [i for i, start in enumerate(starts) if not start.turned and merit[i] > -torch.inf]
     for i in merit.argsort(descending=True, stable=True).tolist():
         alone = all(float((maps[i] - maps[j]).norm()) >= _SAME_START for j in chosen)
-        if alone and merit[i] > -torch.inf and len(chosen) < _CLIMBED:
+        if alone and merit[i] > -torch.inf and len(chosen) < most:
             chosen.append(i)
     return chosen
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchdeform.image import Image, require_registrable, resample
+from torchdeform.image import Image, require_registrable, resample, same_place
 from torchdeform.registration.guidance import Guidance, require_mask
 from torchdeform.registration.intensities import corresponding_channels, fill
 from torchdeform.registration.scene import Scene
@@ -74,7 +74,7 @@ def place(fixed: Subject, moving: Subject, frame: Image) -> Scene:
     nothing to compare.
     """
     like = fixed.image.data
-    images = [_on(frame, s.image, outside=None).to(like) for s in (fixed, moving)]
+    images = [resample(s.image, frame, outside=None).to(like) for s in (fixed, moving)]
     masks = [_mask_on(frame, s) for s in (fixed, moving)]
     points = [None if s.points is None else frame.to_grid(s.points).to(like) for s in (fixed, moving)]
     return Scene(frame.grid, *images, *(None if mask is None else mask.to(like) for mask in masks), *points)
@@ -83,16 +83,8 @@ def place(fixed: Subject, moving: Subject, frame: Image) -> Scene:
 def _mask_on(frame: Image, subject: Subject) -> Tensor | None:
     """Return the weights of a subject on the frame, None if they are 1 everywhere."""
     image, mask = subject.image, subject.mask
-    if mask is None and _same_place(image, frame):
+    if mask is None and same_place(image, frame):
         return None
     mask = replace(image, data=torch.ones_like(image.data[:, :1])) if mask is None else mask
-    weights = _on(frame, mask, outside=0.0)
+    weights = resample(mask, frame)
     return None if bool((weights == 1).all()) else weights
-
-
-def _on(frame: Image, image: Image, *, outside: float | None) -> Tensor:
-    return image.data if _same_place(image, frame) else resample(image, frame, outside=outside)
-
-
-def _same_place(image: Image, frame: Image) -> bool:
-    return (image.grid, image.origin, image.direction) == (frame.grid, frame.origin, frame.direction)

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.grid import Grid
+from torchdeform.registration.products import sparse_product
 
 # A level keeps at least this many nodes along an axis.
 MIN_NODES = 8
@@ -18,8 +19,6 @@ _MIN_LONGEST = 16
 _BLUR = 0.5
 
 _INTERPOLATION = {2: "bilinear", 3: "trilinear"}
-_CONV = {2: F.conv2d, 3: F.conv3d}
-_REPLICATE = "replicate"
 
 
 def pyramid_grids(grid: Grid, levels: int) -> list[Grid]:
@@ -67,10 +66,10 @@ def restrict(image: Tensor, grid: Grid, coarse: Grid) -> Tensor:
     """
     if coarse == grid:
         return image
-    for axis, (h, wide) in enumerate(zip(grid.spacing, coarse.spacing, strict=True)):
-        if wide > h:
-            image = _gaussian(image, axis, _BLUR * wide / h)
-    return _resize(image, coarse)
+    for axis, size in zip(grid.axes, coarse.shape, strict=True):
+        if size != image.shape[axis]:
+            image = sparse_product(image, *_thinning(image, axis, size), axis)
+    return image
 
 
 def prolong(u: Tensor, grid: Grid) -> Tensor:
@@ -87,12 +86,19 @@ def _resize(field: Tensor, grid: Grid) -> Tensor:
     return F.interpolate(field, size=grid.shape, mode=_INTERPOLATION[grid.dim], align_corners=True)
 
 
-def _gaussian(image: Tensor, axis: int, sigma: float) -> Tensor:
-    """Convolve along one axis with a Gaussian of ``sigma`` voxels, the image being continued by its boundary values."""
-    radius, dim = math.ceil(3 * sigma), image.dim() - 2
-    offset = torch.arange(-radius, radius + 1, dtype=image.dtype, device=image.device)
-    kernel = torch.exp(-(offset**2) / (2 * sigma**2))
-    kernel = (kernel / kernel.sum()).view(1, 1, *(-1 if a == axis else 1 for a in range(dim)))
-    padding = [radius if a == axis else 0 for a in reversed(range(dim)) for _ in range(2)]
-    flat = F.pad(image.flatten(0, 1).unsqueeze(1), padding, mode=_REPLICATE)
-    return _CONV[dim](flat, kernel).view(image.shape)
+def _thinning(image: Tensor, axis: int, size: int) -> tuple[Tensor, Tensor]:
+    """Return entries and columns ``(size, width)`` of the matrix that smooths an axis and takes ``size`` nodes of it.
+
+    A Gaussian at every node, the image being continued by its boundary values, then linear interpolation: each row is
+    the mean of the Gaussians around two nodes.
+    """
+    last = image.shape[axis] - 1
+    ratio = last / (size - 1)
+    radius = math.ceil(3 * _BLUR * ratio)
+    offset = torch.arange(-radius, radius + 1, dtype=torch.float64)
+    kernel = torch.exp(-((offset / (_BLUR * ratio)) ** 2) / 2)
+    place = torch.arange(size, dtype=torch.float64).mul(ratio).unsqueeze(1)
+    left = place.floor().clamp(max=last - 1)
+    columns = (left + torch.arange(-radius, radius + 2)).clamp(0, last).long()
+    values = torch.lerp(F.pad(kernel / kernel.sum(), (0, 1)), F.pad(kernel / kernel.sum(), (1, 0)), place - left)
+    return values.to(image), columns.to(image.device)

@@ -6,9 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-# Up to this many nodes an axis one product with the dense band matrix is the fastest box sum (3×128³ float32, window
-# 9: 24 ms an axis against 72 ms for sums of shifted views); its cost per node grows with the axis.
-_DENSE_LIMIT = 512
+from torchdeform.registration.products import DENSE_LIMIT, dense_product
 
 
 def box_sum(x: Tensor, window: int, stride: int = 1) -> Tensor:
@@ -27,8 +25,8 @@ def box_sum(x: Tensor, window: int, stride: int = 1) -> Tensor:
         work is along the first axis, where a product with the matrix is cheapest.
     """
     for axis in range(2, x.dim()):
-        small = x.shape[axis] <= _DENSE_LIMIT
-        x = _product(x, axis, _band(x.shape[axis], window, stride, x)) if small else _far(x, axis, window, stride)
+        small = x.shape[axis] <= DENSE_LIMIT
+        x = dense_product(x, _band(x.shape[axis], window, stride, x), axis) if small else _far(x, axis, window, stride)
     return x
 
 
@@ -45,8 +43,8 @@ def box_spread(y: Tensor, window: int, stride: int, shape: tuple[int, ...]) -> T
         ``(B, C, *S)``.
     """
     for axis, size in reversed(list(enumerate(shape, start=2))):
-        if size <= _DENSE_LIMIT:
-            y = _product(y, axis, _band(size, window, stride, y).T)
+        if size <= DENSE_LIMIT:
+            y = dense_product(y, _band(size, window, stride, y).T, axis)
         else:
             apart = y.new_zeros(*y.shape[:axis], size, *y.shape[axis + 1 :])
             _at_centres(apart, axis, stride).copy_(y)
@@ -65,14 +63,6 @@ def _at_centres(x: Tensor, axis: int, stride: int) -> Tensor:
     """Return every ``stride``-th entry, what is left over shared out between both ends."""
     first = (x.shape[axis] - 1) % stride // 2
     return x[(slice(None),) * axis + (slice(first, None, stride),)]
-
-
-def _product(x: Tensor, axis: int, matrix: Tensor) -> Tensor:
-    """Multiply by a matrix along one axis."""
-    if axis == x.dim() - 1:
-        return x @ matrix.T
-    shape = (*x.shape[:axis], matrix.shape[0], *x.shape[axis + 1 :])
-    return (matrix @ x.flatten(axis + 1)).view(shape)
 
 
 def _band(size: int, window: int, stride: int, like: Tensor) -> Tensor:

@@ -120,7 +120,7 @@ class LocalCrossCorrelation(Similarity):
         each divided by its number of voxels. ε = 1e-5 keeps flat regions finite: they count as not correlated.
         A mask weights the voxels of a window and the windows: E becomes the weighted mean.
         Box sums of 3 fields and the transpose of 3 a call; 3 more for a mask that is not the one of the call before.
-        Windows that overlap by half say the same: with stride 2 all in between is an eighth in 3D, and maps are as good.
+        With stride 2 all that lies in between is an eighth in 3D, and maps are as good.
         Not differentiable, see `lncc`.
     """
 
