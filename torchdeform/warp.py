@@ -9,8 +9,9 @@ from torch import Tensor
 
 from torchdeform.errors import InputError, require_choice
 from torchdeform.grid import Grid
-from torchdeform.stencil import cofactors, determinant, map_jacobian
+from torchdeform.stencil import cofactors, derivative, determinant, map_jacobian
 
+_RESIZE = {2: "bilinear", 3: "trilinear"}
 _MODES = {"linear": "bilinear", "nearest": "nearest"}
 
 # Fewer points than this are not worth more than one thread.
@@ -20,6 +21,12 @@ _POINTS_PER_THREAD = 2**13
 # down to this fraction brings it nearer.
 _SMALLEST_DETERMINANT = 0.01
 _SMALLEST_STEP = 2.0**-7
+
+# The start of `invert` comes from a grid of half as many nodes an axis, down to these; there this error, in voxels,
+# will do. Then so many steps are taken at all nodes at once.
+_FEWEST_NODES = 8
+_START_ERROR = 0.01
+_COMMON_STEPS = 2
 
 # Steps for which the D² entries of ∇φ⁻¹, the dearest part of a step, are kept.
 _REFRESH = 3
@@ -77,14 +84,18 @@ def warp(image: Tensor, u: Tensor, grid: Grid, *, mode: str = "linear", outside:
     """
     grid.check(image, "warp: image")
     grid.check_vector(u, "warp: u")
-    lines = [
-        torch.linspace(-1, 1, n, dtype=u.dtype, device=u.device).view(-1, *([1] * (grid.dim - 1 - k)))
-        for k, n in enumerate(grid.shape)
-    ]
-    values = _sample(image, _normalise(lines, u, grid), mode)
+    values = _sample(image, _normalise(_lines(grid, u), u, grid), mode)
     if outside is None:
         return values
     return torch.where(_inside(grid.points(dtype=u.dtype, device=u.device) + u, grid), values, outside)
+
+
+def _lines(grid: Grid, like: Tensor) -> list[Tensor]:
+    """Return the nodes of each axis in grid_sample's box, to be broadcast along the others."""
+    return [
+        torch.linspace(-1, 1, n, dtype=like.dtype, device=like.device).view(-1, *([1] * (grid.dim - 1 - k)))
+        for k, n in enumerate(grid.shape)
+    ]
 
 
 def _normalise(start: Sequence[Tensor | float], moved: Tensor, grid: Grid) -> Tensor:
@@ -188,15 +199,17 @@ def invert(
         InputError: shapes.
 
     Notes:
-        Mild maps take about 4 steps, strong but fold-free ones up to 30; a step costs D + 1 samplings of u. Where u
-        folds there is no inverse: w is finite and the error says how far it got. Differentiable once in u by the
-        implicit function theorem, with ∇φ⁻¹ from finite differences; no step is kept in memory.
+        Starts from the inverse on a coarser grid; two steps at all nodes, then more where they are needed, up to 30 of
+        strong but fold-free maps. A step costs a sampling of u, every third one 2·D more. Where u folds there is no
+        inverse: w is finite and the error says how far it got. Differentiable once in u by the implicit function
+        theorem, with ∇φ⁻¹ from finite differences; no step is kept in memory.
     """
     grid.check_vector(u, "invert: u")
     with torch.no_grad():
-        inverse = _inverse_jacobian(u, grid)
-        w = _find_inverse(u, inverse, grid, atol, max_steps)
+        w = _find_inverse(u, grid, atol, max_steps)
     if u.requires_grad:
+        with torch.no_grad():
+            inverse = _inverse_jacobian(u, grid)
         moved = warp(u, w, grid)
         w = w - _times(warp(inverse, w, grid), moved - moved.detach())  # w as it is, with δw = −∇φ⁻¹ δu(x + w)
     return (w, max_voxels(compose(u, w, grid), grid)) if return_error else w
@@ -204,7 +217,11 @@ def invert(
 
 def _inverse_jacobian(u: Tensor, grid: Grid) -> Tensor:
     """Return (∇φ)⁻¹ at the nodes, row after row, as ``(B, D·D, *S)``; finite also where φ folds."""
-    matrix = map_jacobian(u, grid)
+    return _inverted(map_jacobian(u, grid))
+
+
+def _inverted(matrix: Tensor) -> Tensor:
+    """Return the inverse of ``(B, D, D, *T)``, row after row, a small determinant counting as one a little larger."""
     inverse = cofactors(matrix).transpose(1, 2) / determinant(matrix).clamp(min=_SMALLEST_DETERMINANT).unsqueeze(1)
     return inverse.flatten(1, 2)
 
@@ -213,45 +230,122 @@ def _times(rows: Tensor, vector: Tensor) -> Tensor:
     return (rows.unflatten(1, (-1, vector.shape[1])) * vector.unsqueeze(1)).sum(dim=2)
 
 
-def _find_inverse(u: Tensor, inverse: Tensor, grid: Grid, atol: float, max_steps: int) -> Tensor:
-    """Solve w + u(x + w) = 0 at every node; nodes that got lost start again where their neighbours ended."""
-    w = keep_inside(-u, grid)  # a start outside Ω, where u is continued, may never find its way back
-    w, error = _newton(u, inverse, w, grid, atol, max_steps)
-    for _ in range(_RESTARTS):
-        lost = error > atol
-        if not bool(lost.any()) or bool(lost.all()):
-            break
-        again = torch.where(lost, _mean_of_neighbours(w, ~lost), w)
-        again, again_error = _newton(u, inverse, again, grid, atol, max_steps)
-        nearer = again_error < error
-        if not bool(nearer.any()):
-            break
-        w, error = torch.where(nearer, again, w), torch.where(nearer, again_error, error)
+def _find_inverse(u: Tensor, grid: Grid, atol: float, max_steps: int) -> Tensor:
+    """Solve w + u(x + w) = 0 at every node: first everywhere at once, then at the nodes that are not there yet.
+
+    The start is the inverse on a grid of half as many nodes an axis, and so on down: one step from it most are there.
+    """
+    halves = tuple(max(_FEWEST_NODES, (n + 1) // 2) if n > _FEWEST_NODES else n for n in grid.shape)
+    if halves == grid.shape:
+        start = -u
+    else:
+        coarse = Grid(halves, tuple(e / (n - 1) for e, n in zip(grid.extent, halves, strict=True)))
+        start = _resized(_find_inverse(_resized(u, coarse), coarse, max(atol, _START_ERROR), max_steps), grid)
+    w = _approach(u, keep_inside(start, grid), grid, atol)  # outside Ω, where u is continued, w may lose its way
+    items = zip(u.split(1), w.split(1), strict=True)
+    return torch.cat([_finished(one, found, grid, atol, max_steps) for one, found in items])
+
+
+def _resized(u: Tensor, grid: Grid) -> Tensor:
+    return F.interpolate(u, size=grid.shape, mode=_RESIZE[grid.dim], align_corners=True)
+
+
+def _approach(u: Tensor, w: Tensor, grid: Grid, atol: float) -> Tensor:
+    """Take a few steps δw = −(I + ∇w) d of Newton's method, d being the defect and I + ∇w = ∇φ⁻¹ once w is near."""
+    defect = compose(u, w, grid)
+    error = voxels(defect, grid)
+    for _ in range(_COMMON_STEPS):
+        trial = w - defect
+        for axis in range(grid.dim):
+            trial.addcmul_(derivative(w, grid, axis), defect[:, axis : axis + 1], value=-1)
+        trial_defect = compose(u, trial, grid)
+        trial_error = voxels(trial_defect, grid)
+        nearer = (error > atol) & (trial_error < error)
+        w, defect = torch.where(nearer, trial, w), torch.where(nearer, trial_defect, defect)
+        error = torch.where(nearer, trial_error, error)
     return w
 
 
-def _newton(u: Tensor, inverse: Tensor, w: Tensor, grid: Grid, atol: float, max_steps: int) -> tuple[Tensor, Tensor]:
-    """Return w after Newton's steps at every node on its own, so that batches do not matter, and the error in voxels.
-
-    A step that brings a node no nearer is undone and halved; a node below atol, or halved too often, is left alone.
-    """
-    defect, rows = compose(u, w, grid), inverse
-    error = voxels(defect, grid)
-    fraction = torch.ones_like(error)
-    for step in range(max_steps):
-        active = (error > atol) & (fraction >= _SMALLEST_STEP)
-        if not bool(active.any()):
+def _finished(u: Tensor, w: Tensor, grid: Grid, atol: float, max_steps: int) -> Tensor:
+    """Return w of one item after Newton's method where it is needed; lost nodes start again from their neighbours."""
+    w = w.clone()
+    error = voxels(compose(u, w, grid), grid)
+    for attempt in range(1 + _RESTARTS):
+        lost = error > atol
+        places = lost.flatten().nonzero()[:, 0]
+        if len(places) == 0 or (attempt and len(places) == lost.numel()):
             break
-        if step % _REFRESH == 0:
-            rows = warp(inverse, w, grid)
+        start = _mean_of_neighbours(w, ~lost) if attempt else w
+        lines = zip(_lines(grid, w), torch.unravel_index(places, grid.shape), strict=True)
+        nodes = torch.stack([line.flatten()[index] for line, index in lines]).unsqueeze(0)
+        found, reached = _newton(u, grid, nodes, start.flatten(2)[..., places], atol, max_steps)
+        nearer = reached < error.flatten(2)[..., places]
+        if not bool(nearer.any()):
+            break
+        w.flatten(2)[..., places] = torch.where(nearer, found, w.flatten(2)[..., places])
+        error.flatten(2)[..., places] = torch.where(nearer, reached, error.flatten(2)[..., places])
+    return w
+
+
+def _newton(u: Tensor, grid: Grid, nodes: Tensor, w: Tensor, atol: float, max_steps: int) -> tuple[Tensor, Tensor]:
+    """Return w ``(1, D, N)`` after Newton's steps at some nodes, each on its own, and the errors in voxels.
+
+    A step that brings a point no nearer is undone and halved; one below the tolerance, or halved too often, is left
+    alone.
+    """
+    defect = w + _from_nodes(u, nodes, w, grid)
+    error = _lengths(defect, grid)
+    state = w, defect, error, torch.ones_like(error)
+    for _ in range(0, max_steps, _REFRESH):
+        w, _, error, fraction = state
+        going = ((error > atol) & (fraction >= _SMALLEST_STEP))[0, 0].nonzero()[:, 0]
+        if len(going) == 0:
+            break
+        moved = _few_steps(u, grid, nodes[..., going], tuple(t[..., going] for t in state), atol)
+        for whole, part in zip(state, moved, strict=True):
+            whole[..., going] = part
+    return state[0], state[2]
+
+
+def _few_steps(u: Tensor, grid: Grid, nodes: Tensor, state: tuple[Tensor, ...], atol: float) -> tuple[Tensor, ...]:
+    """Return w, its defect, its error and the fraction of a step to try, after steps with one ∇φ⁻¹."""
+    w, defect, error, fraction = state
+    rows = _inverse_jacobian_at(u, (nodes + 1) * (_column(grid.extent, w) / 2) + w, grid)
+    for _ in range(_REFRESH):
         trial = w - fraction * _times(rows, defect)
-        trial_defect = compose(u, trial, grid)
-        trial_error = voxels(trial_defect, grid)
+        trial_defect = trial + _from_nodes(u, nodes, trial, grid)
+        trial_error = _lengths(trial_defect, grid)
+        active = error > atol
         nearer = active & (trial_error < error)
         w, defect = torch.where(nearer, trial, w), torch.where(nearer, trial_defect, defect)
         error = torch.where(nearer, trial_error, error)
         fraction = torch.where(nearer, (2 * fraction).clamp(max=1.0), torch.where(active, fraction / 2, fraction))
-    return w, error
+    return w, defect, error, fraction
+
+
+def _inverse_jacobian_at(u: Tensor, points: Tensor, grid: Grid) -> Tensor:
+    """Return (∇φ)⁻¹ at points of Ω, row after row, from differences over one voxel to either side."""
+    columns = []
+    for axis, (h, length) in enumerate(zip(grid.spacing, grid.extent, strict=True)):
+        ends = [points.clone(), points.clone()]
+        ends[0][:, axis] = (points[:, axis] - h).clamp(0, length - h)
+        ends[1][:, axis] = (points[:, axis] + h).clamp(h, length)
+        moved = [end + sample(u, end, grid) for end in ends]
+        columns.append((moved[1] - moved[0]) / (ends[1] - ends[0])[:, axis : axis + 1])
+    return _inverted(torch.stack(columns, dim=2))
+
+
+def _from_nodes(u: Tensor, nodes: Tensor, w: Tensor, grid: Grid) -> Tensor:
+    """Return u(x + w) at nodes ``(1, D, N)`` of grid_sample's box, rounded as `warp` does."""
+    return _sample(u, _normalise(nodes.unbind(1), w, grid), "linear")
+
+
+def _column(values: Sequence[float], like: Tensor) -> Tensor:
+    return torch.tensor(values, dtype=like.dtype, device=like.device).view(-1, 1)
+
+
+def _lengths(defect: Tensor, grid: Grid) -> Tensor:
+    return (defect / _column(grid.spacing, defect)).square_().sum(dim=1, keepdim=True).sqrt_()
 
 
 def _mean_of_neighbours(w: Tensor, known: Tensor) -> Tensor:
