@@ -1,5 +1,6 @@
 """Sampling images and fields at moved points: warp, compose, invert. The only file that calls grid_sample."""
 
+import math
 from collections.abc import Sequence
 from typing import Literal, overload
 
@@ -276,8 +277,9 @@ def _finished(u: Tensor, w: Tensor, grid: Grid, atol: float, max_steps: int) -> 
         if len(places) == 0 or (attempt and len(places) == lost.numel()):
             break
         start = _mean_of_neighbours(w, ~lost) if attempt else w
-        lines = zip(_lines(grid, w), torch.unravel_index(places, grid.shape), strict=True)
-        nodes = torch.stack([line.flatten()[index] for line, index in lines]).unsqueeze(0)
+        strides = [math.prod(grid.shape[k + 1 :]) for k in range(grid.dim)]
+        lines = zip(_lines(grid, w), strides, grid.shape, strict=True)
+        nodes = torch.stack([line.flatten()[places // stride % n] for line, stride, n in lines]).unsqueeze(0)
         found, reached = _newton(u, grid, nodes, start.flatten(2)[..., places], atol, max_steps)
         nearer = reached < error.flatten(2)[..., places]
         if not bool(nearer.any()):

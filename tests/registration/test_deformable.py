@@ -9,10 +9,12 @@ from pictures import bend, blobs
 
 from torchdeform.diagnostics import diagnose
 from torchdeform.errors import InputError
+from torchdeform.flow import integrate
 from torchdeform.grid import Grid
 from torchdeform.image import Image, resample
 from torchdeform.registration.deformable import register
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.steps import advance
 from torchdeform.warp import compose, max_voxels, warp
 
 QUICK = RegistrationSettings(steps=(30, 30, 20), length=6.0, window=7)
@@ -192,3 +194,11 @@ def test_bad_input_is_named(fixed, moving, message):
 def test_settings_out_of_range_are_named(setting, value):
     with pytest.raises(InputError, match=setting):
         RegistrationSettings(**{setting: value})
+
+
+def test_a_step_follows_the_flow_of_its_velocity():
+    grid = Grid((12, 14), (1.0, 0.5))
+    v = 0.3 * torch.rand(1, 2, *grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    u = torch.zeros_like(v)
+    moved, *_ = advance((u, torch.ones_like(v[:, :1])), v, grid, 0.01)
+    torch.testing.assert_close(moved, integrate(v, grid, steps=1, method="midpoint"))
