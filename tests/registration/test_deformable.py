@@ -14,7 +14,7 @@ from torchdeform.grid import Grid
 from torchdeform.image import Image, resample
 from torchdeform.registration.deformable import register
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.registration.steps import advance
+from torchdeform.registration.steps import advance, relaxed
 from torchdeform.warp import compose, max_voxels, warp
 
 QUICK = RegistrationSettings(steps=(30, 30, 20), length=6.0, window=7)
@@ -41,7 +41,9 @@ def test_a_known_map_is_found(shape, similarity, device):
 
 @pytest.mark.parametrize("shape", [(48, 40), (24, 20, 28)])
 def test_images_that_have_nothing_in_common_do_not_make_it_fold(shape):
-    greedy = RegistrationSettings(steps=(40, 40, 40), length=2.0, step_length=1.0, similarity="ssd", tolerance=0.0)
+    greedy = RegistrationSettings(
+        steps=(40, 40, 40), length=2.0, elasticity=0.0, step_length=1.0, similarity="ssd", tolerance=0.0
+    )
     result = register(blobs(shape, 1), blobs(shape, 2), greedy)
     assert sum(level.shortened for level in result.levels) > 0  # it had to be held back
     assert result.diagnosis.folds.item() == 0
@@ -200,5 +202,28 @@ def test_a_step_follows_the_flow_of_its_velocity():
     grid = Grid((12, 14), (1.0, 0.5))
     v = 0.3 * torch.rand(1, 2, *grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     u = torch.zeros_like(v)
-    moved, *_ = advance((u, torch.ones_like(v[:, :1])), v, grid, 0.01)
+    moved, *_ = advance((u, torch.ones_like(v[:, :1])), v, torch.zeros(1), grid, 0.01)
     torch.testing.assert_close(moved, integrate(v, grid, steps=1, method="midpoint"))
+
+
+@pytest.mark.parametrize("shape", [(12, 14), (9, 10, 11)])
+def test_a_displacement_relaxes_as_heat_spreads(shape):
+    grid, share = Grid(shape), torch.tensor([0.1, 0.0], dtype=torch.float64)
+    sides = [n - 1 for n in shape]
+    phase = torch.pi * grid.points(dtype=torch.float64)[0] / torch.tensor(sides).view(-1, *[1] * len(shape))
+    sine, cosine = phase.sin(), phase.cos()  # sin along the own axis, so that the faces stay, cos along the others
+    axes = range(len(shape))
+    u = torch.stack([torch.stack([sine[b] if b == a else cosine[b] for b in axes]).prod(0) for a in axes]).expand(
+        2, *[-1] * (len(shape) + 1)
+    )
+    factor = math.prod((1 + math.cos(math.pi / side)) / 2 for side in sides)  # of the kernel 1, 2, 1 for these waves
+    expected = torch.stack([(1 - 0.1 * (1 - factor)) * u[0], u[1]])
+    torch.testing.assert_close(relaxed(u, share, grid), expected)
+    assert torch.equal(relaxed(u[1:], share[1:], grid), u[1:])
+
+
+def test_elasticity_keeps_a_map_nearer_to_an_affine_one():
+    fixed, moving = blobs((48, 56), 1), blobs((48, 56), 2)
+    stiff, soft = (register(fixed, moving, replace(QUICK, elasticity=e)) for e in (0.5, 0.0))
+    bends = [result.displacement.diff(n=2, dim=-1).abs().mean().item() for result in (stiff, soft)]
+    assert bends[0] < 0.7 * bends[1]

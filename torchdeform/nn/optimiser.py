@@ -19,6 +19,7 @@ from torchdeform.nn.precision import full_precision
 from torchdeform.registration.levels import image_force, metric_weights, step_length, strongest_of
 from torchdeform.registration.metrics.base import column
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.steps import relaxed
 from torchdeform.warp import compose, warp
 
 # Measures of images as they are; ``mind`` compares features, which need warping of their own.
@@ -32,7 +33,8 @@ class DeformableRegistration(nn.Module):
         grid: the grid of images and displacement.
         steps: how many.
         settings: ``similarity`` (a name but ``mind``), ``window``, ``weight_div``, ``weight_curl``, ``length``,
-            ``power``, ``step_length`` and ``min_determinant`` are used; those of the preset ``default`` when None.
+            ``elasticity``, ``power``, ``step_length`` and ``min_determinant`` are used; those of the preset
+            ``default`` when None.
 
     Raises:
         InputError: steps below 1, a similarity that is a mixture or ``mind``.
@@ -87,6 +89,7 @@ class DeformableRegistration(nn.Module):
         longest = (move / self.grid.along(self.grid.spacing, move)).square().sum(1).flatten(1).amax(1).sqrt()
         move = move * column(pace / longest.clamp(min=torch.finfo(move.dtype).tiny), move)
         trial = compose(u, integrate(move, self.grid, steps=1, method="midpoint"), self.grid)
+        trial = relaxed(trial, u.new_full((len(u),), self.settings.elasticity), self.grid)
         with torch.no_grad():
             least = smallest_determinant(u, self.grid).clamp(max=self.settings.min_determinant)
             share = open_share(u.detach(), (trial - u).detach(), least, self.grid.spacing, math.inf, math.inf)

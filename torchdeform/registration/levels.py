@@ -179,7 +179,7 @@ def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> 
 
 
 def _steps(level: _Level, steps: int) -> int:
-    """Return the steps of a level: a coarser map has less to find, in as many times fewer steps."""
+    """Return the steps of a level: a coarser map has less to find, in map_spacing² times fewer steps."""
     return steps if level.transfer is None else math.ceil(steps / level.settings.map_spacing**2)
 
 

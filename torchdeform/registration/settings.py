@@ -50,15 +50,15 @@ class RegistrationSettings:
         weight_curl: price w_c of a rotation.
         length: range √(w_d / w_0) of the metric in voxels of each level's map; longer makes the velocity smoother. One
             number, or one for each level, coarse to fine: the last is for the finest, the first for all not named.
-        elasticity: share of the way to the mean of its neighbours, 0 to 1, that the displacement of every node of the map
-            is taken in every step: `length` smooths each step, this the whole; larger is smoother.
+        elasticity: share of the way to the mean of its neighbours, 0 to 1, that the displacement of every node of the
+            map is taken in every step: `length` smooths each step, this the whole; larger is smoother.
         power: 1, or 2 for a smoother velocity, see `TransformSolver.solve`.
         steps: steps at most on each pyramid level, coarse to fine; its length is the number of levels (a level that
             would leave fewer than 16 nodes on every axis is dropped).
         step_length: longest move in one step, in voxels of the map; falls linearly to a tenth of this over a level.
         tolerance: a level stops when 10 steps raised the best similarity by less than this share of its rise so far.
         map_spacing: spacing of the grid that carries the map, in voxels of the level's images, on levels of more than
-            2^17 voxels, which take as many times fewer steps; smaller ones carry it at every voxel.
+            2^17 voxels, which take map_spacing² times fewer steps; smaller ones carry it at every voxel.
         soft_determinant: where a one-sided determinant J is smaller than this, a divergence proportional to
             soft_determinant/J − 1 is asked for, which opens the grid up again; 0 switches it off.
         min_determinant: smallest one-sided determinant that a step may leave; a step that would go below is shortened.
@@ -76,8 +76,8 @@ class RegistrationSettings:
     window: int = 9
     weight_div: float = 0.5
     weight_curl: float = 1.0
-    length: float | tuple[float, ...] = 3.0
-    elasticity: float = 0.1
+    length: float | tuple[float, ...] = (8.0, 4.0, 2.5)
+    elasticity: float = 0.08
     power: int = 1
     steps: tuple[int, ...] = (60, 60, 60)
     step_length: float = 0.5
