@@ -1,13 +1,10 @@
 """Coarse to fine: grids of one box Ω with fewer nodes, images smoothed onto them, displacements brought up again."""
 
-import math
-
-import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.grid import Grid
-from torchdeform.registration.products import sparse_product
+from torchdeform.registration.banded import multiply, restriction
 
 # A level keeps at least this many nodes along an axis.
 MIN_NODES = 8
@@ -64,12 +61,8 @@ def restrict(image: Tensor, grid: Grid, coarse: Grid) -> Tensor:
         grid: its grid.
         coarse: the grid wanted.
     """
-    if coarse == grid:
-        return image
-    for axis, size in zip(grid.axes, coarse.shape, strict=True):
-        if size != image.shape[axis]:
-            image = sparse_product(image, *_thinning(image, axis, size), axis)
-    return image
+    counts = zip(grid.shape, coarse.shape, strict=True)
+    return multiply(image, [restriction(many, few, _BLUR, image) for many, few in counts])
 
 
 def prolong(u: Tensor, grid: Grid) -> Tensor:
@@ -79,26 +72,6 @@ def prolong(u: Tensor, grid: Grid) -> Tensor:
         u: ``(B, D, *S)`` in units of spacing.
         grid: the grid wanted.
     """
-    return u if tuple(u.shape[2:]) == grid.shape else _resize(u, grid)
-
-
-def _resize(field: Tensor, grid: Grid) -> Tensor:
-    return F.interpolate(field, size=grid.shape, mode=_INTERPOLATION[grid.dim], align_corners=True)
-
-
-def _thinning(image: Tensor, axis: int, size: int) -> tuple[Tensor, Tensor]:
-    """Return entries and columns ``(size, width)`` of the matrix that smooths an axis and takes ``size`` nodes of it.
-
-    A Gaussian at every node, the image being continued by its boundary values, then linear interpolation: each row is
-    the mean of the Gaussians around two nodes.
-    """
-    last = image.shape[axis] - 1
-    ratio = last / (size - 1)
-    radius = math.ceil(3 * _BLUR * ratio)
-    offset = torch.arange(-radius, radius + 1, dtype=torch.float64)
-    kernel = torch.exp(-((offset / (_BLUR * ratio)) ** 2) / 2)
-    place = torch.arange(size, dtype=torch.float64).mul(ratio).unsqueeze(1)
-    left = place.floor().clamp(max=last - 1)
-    columns = (left + torch.arange(-radius, radius + 2)).clamp(0, last).long()
-    values = torch.lerp(F.pad(kernel / kernel.sum(), (0, 1)), F.pad(kernel / kernel.sum(), (1, 0)), place - left)
-    return values.to(image), columns.to(image.device)
+    if tuple(u.shape[2:]) == grid.shape:
+        return u
+    return F.interpolate(u, size=grid.shape, mode=_INTERPOLATION[grid.dim], align_corners=True)
