@@ -1,7 +1,7 @@
 """Geometry of a regular grid: shape, spacing, and the positions of its nodes."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from operator import index
@@ -10,6 +10,9 @@ import torch
 from torch import Tensor
 
 from torchdeform.errors import InputError
+
+# Nodes computed at once: few enough that a CPU's cache and allocator hold what belongs to them, many enough for a GPU.
+_SLAB_NODES = {"cpu": 2**17, "cuda": 2**22}
 
 
 @dataclass(frozen=True)
@@ -70,10 +73,28 @@ class Grid:
         """Return D numbers as a ``(1, D, 1, ..)`` tensor that broadcasts over a vector field like ``like``."""
         return torch.as_tensor(values, dtype=like.dtype, device=like.device).view(1, self.dim, *([1] * self.dim))
 
-    def points(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None) -> Tensor:
-        """Return the node positions x as a ``(1, D, *S)`` tensor in units of spacing, node 0 at the origin."""
+    def slabs(self, device: torch.device, *, least: int = 1) -> Iterator[slice]:
+        """Yield the rows of the first axis, a slab of at least so many at a time, for what needs much memory a node."""
+        rows = max(least, _SLAB_NODES.get(device.type, 2**22) // math.prod(self.shape[1:]))
+        for start in range(0, self.shape[0], rows):
+            yield slice(start, min(start + rows, self.shape[0]))
+
+    def points(
+        self,
+        *,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+        rows: slice = slice(None),
+    ) -> Tensor:
+        """Return the node positions x as a ``(1, D, *S)`` tensor in units of spacing, node 0 at the origin.
+
+        Args:
+            dtype: floating type wanted.
+            device: device wanted.
+            rows: of the first axis; all of them by default.
+        """
         steps = [torch.arange(n, dtype=dtype, device=device) * h for n, h in zip(self.shape, self.spacing, strict=True)]
-        return torch.stack(torch.meshgrid(*steps, indexing="ij")).unsqueeze(0)
+        return torch.stack(torch.meshgrid(steps[0][rows], *steps[1:], indexing="ij")).unsqueeze(0)
 
     def quadrature(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None) -> Tensor:
         """Return the trapezoidal weights ``(1, 1, *S)`` with Σ w f = ∫ f for every Q1 function f; their sum is |Ω|."""

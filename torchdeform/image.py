@@ -95,10 +95,14 @@ def resample(
     """
     if u is None and same_place(moving, fixed):
         return moving.data
-    points = fixed.grid.points(dtype=torch.float64, device=moving.data.device)
-    if u is not None:
-        points = points + u
-    return sample(moving.data, moving.to_grid(fixed.to_world(points)), moving.grid, mode=mode, outside=outside)
+    grid, device = fixed.grid, moving.data.device
+
+    def values(rows: slice) -> Tensor:
+        points = grid.points(dtype=torch.float64, device=device, rows=rows)
+        points = points if u is None else points + u[:, :, rows]
+        return sample(moving.data, moving.to_grid(fixed.to_world(points)), moving.grid, mode=mode, outside=outside)
+
+    return torch.cat([values(rows) for rows in grid.slabs(device)], dim=2)
 
 
 def same_place(a: Image, b: Image) -> bool:

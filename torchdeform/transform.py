@@ -1,6 +1,5 @@
 """Maps between physical spaces, in world points (x, y, z) in LPS mm: what `io` writes for ITK and reads from it."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -18,9 +17,6 @@ _LARGEST_LEAK = 0.5
 
 # Nodes along each axis of a face that an affine map is fitted to, about.
 _LATTICE = 24
-
-# Nodes computed at once: few enough that a CPU's cache and allocator hold their coordinates, many enough for a GPU.
-_NODES_AT_ONCE = {"cpu": 2**17, "cuda": 2**22}
 
 
 @dataclass(frozen=True)
@@ -444,10 +440,5 @@ def _require_overlap(image: Image, space: Image, name: str, hint: str) -> None:
 
 def _over_nodes(place: Image, function: Callable[[Tensor], Tensor], device: torch.device) -> Tensor:
     """Return a function ``(1, D, *T) -> (1, C, *T)`` of world points at all nodes, a few rows at a time."""
-    rows = max(_NODES_AT_ONCE.get(device.type, 2**22) // math.prod(place.grid.shape[1:]), 1)
-    steps = [
-        torch.arange(n, dtype=torch.float64, device=device) * h
-        for n, h in zip(place.grid.shape, place.grid.spacing, strict=True)
-    ]
-    slabs = (torch.stack(torch.meshgrid(part, *steps[1:], indexing="ij")) for part in steps[0].split(rows))
-    return torch.cat([function(place.to_world(slab.unsqueeze(0))) for slab in slabs], dim=2)
+    slabs = (place.grid.points(dtype=torch.float64, device=device, rows=rows) for rows in place.grid.slabs(device))
+    return torch.cat([function(place.to_world(slab)) for slab in slabs], dim=2)
