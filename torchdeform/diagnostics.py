@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.grid import Grid
-from torchdeform.stencil import CURL_PAIRS, jacobian_determinant
+from torchdeform.stencil import CURL_PAIRS, by_slabs, jacobian_determinant
 from torchdeform.warp import compose, voxels
 
 # The frames of steps that span the simplices around a node: (steps, ends, determinant). A step goes along one or two
@@ -81,7 +81,7 @@ def diagnose(u: Tensor, grid: Grid) -> Diagnosis:
         NaN counts as a fold. Not differentiable. ``folds`` and ``central_folds`` are the counts of Liu et al., "On
         Finite Difference Jacobian Computation in Deformable Image Registration", IJCV 2024.
     """
-    det = jacobian_determinant(u, grid).flatten(1)
+    det = by_slabs(jacobian_determinant, u, grid).flatten(1)
     lowest = one_sided_determinant(u, grid).flatten(1)
     return Diagnosis(
         det_min=det.amin(1),
@@ -90,7 +90,7 @@ def diagnose(u: Tensor, grid: Grid) -> Diagnosis:
         det_log_std=det.clamp(min=LOG_FLOOR).log().std(1),
         smallest=lowest.amin(1),
         folds=_count_folds(lowest),
-        central_folds=_count_folds(_central_determinant(u, grid).flatten(1)),
+        central_folds=_count_folds(by_slabs(_central_determinant, u, grid).flatten(1)),
     )
 
 

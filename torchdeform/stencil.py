@@ -1,5 +1,6 @@
 """Finite differences as kernels: derivative, divergence, curl, Jacobian matrix, determinant and cofactors."""
 
+from collections.abc import Callable
 from itertools import product
 
 import torch
@@ -16,6 +17,9 @@ KERNELS: dict[int, tuple[tuple[float, ...], tuple[tuple[float, ...], ...]]] = {
         ((-25 / 12, 4, -3, 4 / 3, -1 / 4), (-1 / 4, -5 / 6, 3 / 2, -1 / 2, 1 / 12)),
     ),
 }
+
+# Rows of a slab at least, because the two next to it are computed with it.
+_LEAST_ROWS = 4
 
 # The curl in each dimension: component c is ∂_a u_b − ∂_b u_a for the c-th pair (a, b).
 CURL_PAIRS: dict[int, tuple[tuple[int, int], ...]] = {2: ((0, 1),), 3: ((1, 2), (2, 0), (0, 1))}
@@ -205,3 +209,21 @@ def map_jacobian(u: Tensor, grid: Grid, *, order: int = 2) -> Tensor:
     grid.check_vector(u, "jacobian: u")
     eye = torch.eye(grid.dim, dtype=u.dtype, device=u.device).view(1, grid.dim, grid.dim, *([1] * grid.dim))
     return jacobian(u, grid, order=order) + eye
+
+
+@torch.no_grad()
+def by_slabs(function: Callable[[Tensor, Grid], Tensor], u: Tensor, grid: Grid) -> Tensor:
+    """Return function(u, grid) ``(B, C, *S)``, computed by slabs of rows so that what it needs on the way is small.
+
+    Args:
+        function: of a field and its grid; looks no farther than one node inside, three at the faces.
+        u: ``(B, D, *S)``.
+        grid: its grid.
+    """
+    last, parts = grid.shape[0], []
+    for rows in grid.slabs(u.device, least=_LEAST_ROWS):
+        low, high = max(min(rows.start - 1, last - 3), 0), min(max(rows.stop + 1, 3), last)
+        part = Grid((high - low, *grid.shape[1:]), grid.spacing)
+        values = function(u.narrow(2, low, high - low), part)
+        parts.append(values[:, :, rows.start - low : rows.stop - low].contiguous())
+    return torch.cat(parts, dim=2)
