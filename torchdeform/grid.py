@@ -1,9 +1,9 @@
 """Geometry of a regular grid: shape, spacing, and the positions of its nodes."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import chain, product
 from operator import index
 
 import torch
@@ -127,3 +127,27 @@ class Grid:
     def check_scalar(self, field: Tensor, name: str) -> None:
         """Raise `InputError` unless ``field`` is a ``(B, 1, *S)`` scalar field on this grid."""
         self.check(field, name, components=1)
+
+
+def over_slabs(values: Callable[[slice], Tensor], grid: Grid, device: torch.device, *, least: int = 1) -> Tensor:
+    """Return what a function of rows of the first axis has to say, ``(B, C, *T)`` each, for all of them together.
+
+    Args:
+        values: of the rows of a slab.
+        grid: the grid they belong to.
+        device: where the values are made.
+        least: rows of a slab at least.
+
+    Notes:
+        Slabs are copied into place as they come. Where a gradient is wanted they are joined at the end: it would be
+        copied as a whole for every slab otherwise.
+    """
+    parts = map(values, grid.slabs(device, least=least))
+    first = next(parts)
+    if first.requires_grad:
+        return torch.cat([first, *parts], dim=2)
+    whole, start = first.new_empty(*first.shape[:2], grid.shape[0], *first.shape[3:]), 0
+    for part in chain((first,), parts):
+        whole.narrow(2, start, part.shape[2]).copy_(part)
+        start += part.shape[2]
+    return whole

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
+from torchdeform.grid import Grid, over_slabs
 from torchdeform.warp import sample
 
 # Alpha that means opaque, by pixel type; floating types count from 0 to 1.
@@ -102,7 +102,7 @@ def resample(
         points = points if u is None else points + u[:, :, rows]
         return sample(moving.data, moving.to_grid(fixed.to_world(points)), moving.grid, mode=mode, outside=outside)
 
-    return torch.cat([values(rows) for rows in grid.slabs(device)], dim=2)
+    return over_slabs(values, grid, device)
 
 
 def same_place(a: Image, b: Image) -> bool:

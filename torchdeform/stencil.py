@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.errors import InputError, require_choice
-from torchdeform.grid import Grid
+from torchdeform.grid import Grid, over_slabs
 
 # order -> (interior kernel, one-sided kernels for the first nodes); the last nodes mirror them with the sign turned.
 KERNELS: dict[int, tuple[tuple[float, ...], tuple[tuple[float, ...], ...]]] = {
@@ -220,10 +220,11 @@ def by_slabs(function: Callable[[Tensor, Grid], Tensor], u: Tensor, grid: Grid) 
         u: ``(B, D, *S)``.
         grid: its grid.
     """
-    last, parts = grid.shape[0], []
-    for rows in grid.slabs(u.device, least=_LEAST_ROWS):
+    last = grid.shape[0]
+
+    def values(rows: slice) -> Tensor:
         low, high = max(min(rows.start - 1, last - 3), 0), min(max(rows.stop + 1, 3), last)
         part = Grid((high - low, *grid.shape[1:]), grid.spacing)
-        values = function(u.narrow(2, low, high - low), part)
-        parts.append(values[:, :, rows.start - low : rows.stop - low].contiguous())
-    return torch.cat(parts, dim=2)
+        return function(u.narrow(2, low, high - low), part)[:, :, rows.start - low : rows.stop - low]
+
+    return over_slabs(values, grid, u.device, least=_LEAST_ROWS)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.errors import InputError
+from torchdeform.grid import over_slabs
 from torchdeform.image import Image, overlap
 from torchdeform.interpolation import LABEL_MODE, interpolator
 from torchdeform.stencil import jacobian_determinant
@@ -440,5 +441,8 @@ def _require_overlap(image: Image, space: Image, name: str, hint: str) -> None:
 
 def _over_nodes(place: Image, function: Callable[[Tensor], Tensor], device: torch.device) -> Tensor:
     """Return a function ``(1, D, *T) -> (1, C, *T)`` of world points at all nodes, a few rows at a time."""
-    slabs = (place.grid.points(dtype=torch.float64, device=device, rows=rows) for rows in place.grid.slabs(device))
-    return torch.cat([function(place.to_world(slab)) for slab in slabs], dim=2)
+
+    def values(rows: slice) -> Tensor:
+        return function(place.to_world(place.grid.points(dtype=torch.float64, device=device, rows=rows)))
+
+    return over_slabs(values, place.grid, device)

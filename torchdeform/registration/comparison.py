@@ -34,12 +34,13 @@ class Comparison:
     still: Tensor | None = None
     sides: int = 1
 
-    def look(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the images warped by u ``(sides·B, D, *S)``, S per pair, and N ∂S/∂warped."""
+    def look(self, u: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the images warped by u ``(sides·B, D, *S)``, as they are when None, S per pair, and N ∂S/∂warped."""
+        warped = self._masked if u is None else warp(self._masked, u, self.grid)
+        del u  # where a coarser grid carries the map, nobody else holds it
         if self.masks is None:
-            warped = warp(self.images, u, self.grid)
             return warped, *self.similarity.evaluate(warped, self.still)
-        warped, mask = warp(self._masked, u, self.grid).tensor_split([-1], dim=1)
+        warped, mask = warped.tensor_split([-1], dim=1)
         return warped, *self.similarity.evaluate(warped.contiguous(), self._weight(mask))
 
     @cached_property

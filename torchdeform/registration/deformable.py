@@ -1,6 +1,6 @@
 """Registration by flows, from the images to the result: checks, scales, places, climbs the levels, inverts, judges."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import torch
@@ -95,11 +95,11 @@ def _register_tensors(
     scene = tensor_scene(fixed, moving, grid, guidance)
     _require_finite(scene)
     scene = scene.scaled(settings)
-    middle = between_tensors(scene) if settings.symmetric else None
-    u, records = _climb(scene, middle, settings, start, callback)
-    with threads_worth(len(u), grid):
-        warped, evaluation = warp(moving, u, grid), evaluate_tensors(guidance, u, grid)
-    return replace(_finish(scene, u, warped, settings, records), evaluation=evaluation)
+    climbed = _climb(scene, between_tensors(scene) if settings.symmetric else None, settings, start, callback)
+    del scene
+    with threads_worth(len(climbed.u), grid):
+        warped, evaluation = warp(moving, climbed.u, grid), evaluate_tensors(guidance, climbed.u, grid)
+    return replace(_finish(climbed, grid, warped, settings), evaluation=evaluation)
 
 
 def _checked_grid(fixed: Tensor, moving: Tensor, guidance: Guidance) -> Grid:
@@ -138,24 +138,32 @@ def _register_images(
     fixed, moving = images
     _require_size(fixed.grid)
     guidance.require_images(fixed.grid.dim)
-    both = subjects(fixed, moving, guidance)
-    alignment = None
-    if affine is None and settings.align != "none":
-        alignment = _aligned(fixed, moving, settings, guidance)
-        affine = alignment.affine
+    scene, middle, affine, alignment = _placed(fixed, moving, settings, guidance, affine)
+    climbed = _climb(scene, middle, settings, start, callback)
+    del scene, middle
     seen = moving if affine is None else moved(moving, affine.inverse())
-    scene = place(both[0], both[1] if affine is None else both[1].moved(affine.inverse()), fixed).scaled(settings)
-    middle = _between(both, scene, affine, settings) if settings.symmetric else None
-    u, records = _climb(scene, middle, settings, start, callback)
-    warped = resample(seen, fixed, u).to(moving.data.dtype)
-    result = _finish(scene, u, warped, settings, records)
+    warped = resample(seen, fixed, climbed.u).to(moving.data.dtype)
+    result = _finish(climbed, fixed.grid, warped, settings)
     return replace(
         result,
         affine=affine,
         alignment=alignment,
-        evaluation=evaluate_images(fixed, guidance, affine, u),
+        evaluation=evaluate_images(fixed, guidance, affine, climbed.u),
         seconds=({"align": alignment.seconds} if alignment else {}) | result.seconds,
     )
+
+
+def _placed(
+    fixed: Image, moving: Image, settings: RegistrationSettings, guidance: Guidance, affine: Affine | None
+) -> tuple[Scene, Middle | None, Affine | None, Alignment | None]:
+    """Return the scene on the fixed grid, with ``symmetric`` the space between, the affine map, how it was found."""
+    both, alignment = subjects(fixed, moving, guidance), None
+    if affine is None and settings.align != "none":
+        alignment = _aligned(fixed, moving, settings, guidance)
+        affine = alignment.affine
+    there = both[1] if affine is None else both[1].moved(affine.inverse())
+    scene = place(both[0], there, fixed).scaled(settings)
+    return scene, _between(both, scene, affine, settings) if settings.symmetric else None, affine, alignment
 
 
 def _aligned(fixed: Image, moving: Image, settings: RegistrationSettings, guidance: Guidance) -> Alignment:
@@ -176,21 +184,39 @@ def _between(
     return replace(middle, scene=middle.scene.scaled(settings))
 
 
+@dataclass(frozen=True)
+class _Climbed:
+    """Where the climb ended: the displacement on the fixed grid, how each level went, similarities, seconds."""
+
+    u: Tensor
+    records: tuple[LevelRecord, ...]
+    before: Tensor
+    after: Tensor
+    seconds: float
+
+
 def _climb(
     scene: Scene,
     middle: Middle | None,
     settings: RegistrationSettings,
     start: Tensor | None,
     callback: Callback | None,
-) -> tuple[Tensor, tuple[LevelRecord, ...]]:
-    """Return the displacement on the fixed grid, from there or from the middle, and how each level went."""
+) -> _Climbed:
+    """Climb from the fixed grid or from the middle; the images as they are compared are needed no more then."""
     if start is not None:
         start = _checked_start(start, scene)
     elif settings.start == "discrete":
         start = discrete_start(scene.fixed, scene.moving, scene.grid, mask=scene.fixed_mask)
     if middle is not None:
-        return climb_from_middle(middle, scene.grid, settings, start, callback)
-    return climb_levels(scene, settings, start, callback)
+        u, records = climb_from_middle(middle, scene.grid, settings, start, callback)
+    else:
+        u, records = climb_levels(scene, settings, start, callback)
+    climbed = perf_counter()
+    with threads_worth(len(u), scene.grid):
+        comparison = compare_from_fixed(scene, settings)
+        before, after = comparison.look()[1], comparison.look(u)[1]
+    seconds = sum(record.seconds for record in records) + perf_counter() - climbed
+    return _Climbed(u, records, before, after, seconds)
 
 
 def _checked_start(start: Tensor, scene: Scene) -> Tensor:
@@ -203,33 +229,27 @@ def _checked_start(start: Tensor, scene: Scene) -> Tensor:
     return start.to(scene.fixed)
 
 
-def _finish(
-    scene: Scene, u: Tensor, warped: Tensor, settings: RegistrationSettings, records: tuple[LevelRecord, ...]
-) -> RegistrationResult:
+def _finish(climbed: _Climbed, grid: Grid, warped: Tensor, settings: RegistrationSettings) -> RegistrationResult:
     """Invert the map and judge it."""
-    grid = scene.grid
-    with threads_worth(len(u), grid):
+    with threads_worth(len(climbed.u), grid):
         start = perf_counter()
-        comparison = compare_from_fixed(scene, settings)
-        before, after = (comparison.look(w)[1] for w in (torch.zeros_like(u), u))
-        middle = perf_counter()
-        inverse = invert(u, grid)
-        mean, largest = inverse_error(u, inverse, grid)
+        inverse = invert(climbed.u, grid)
+        mean, largest = inverse_error(climbed.u, inverse, grid)
         inverted = perf_counter()
         return RegistrationResult(
-            displacement=u,
+            displacement=climbed.u,
             inverse=inverse,
             warped=warped,
             grid=grid,
-            similarity_before=before,
-            similarity_after=after,
-            diagnosis=_require_sound(u, grid),
+            similarity_before=climbed.before,
+            similarity_after=climbed.after,
+            diagnosis=_require_sound(climbed.u, grid),
             inverse_error_mean=mean,
             inverse_error_max=largest,
-            levels=records,
+            levels=climbed.records,
             seconds={
-                "register": sum(record.seconds for record in records) + middle - start,
-                "invert": inverted - middle,
+                "register": climbed.seconds,
+                "invert": inverted - start,
                 "diagnose": perf_counter() - inverted,
             },
             settings=settings,

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
+from torchdeform.grid import Grid, over_slabs
 from torchdeform.image import Image, resample
 from torchdeform.interpolation import LABEL_MODE, interpolator
 from torchdeform.registration.guidance import Guidance
@@ -60,7 +60,7 @@ def evaluate_tensors(guidance: Guidance, u: Tensor, grid: Grid) -> Evaluation | 
         pairs = points and (points[0] + sample(w, points[0].to(w), grid), points[1])
         return _measures(regions, pairs, grid, labels)
 
-    return Evaluation(at(torch.zeros_like(u)), None, at(u), labels and LABEL_MODE)
+    return Evaluation(at(u.new_zeros(()).expand_as(u)), None, at(u), labels and LABEL_MODE)
 
 
 def evaluate_images(fixed: Image, guidance: Guidance, affine: Affine | None, u: Tensor) -> Evaluation | None:
@@ -84,7 +84,7 @@ def evaluate_images(fixed: Image, guidance: Guidance, affine: Affine | None, u: 
         pairs = points and (carry_points(points[0], fixed, world, w), points[1])
         return _measures(seen, pairs, fixed.grid, regions and (regions[0], regions[1].data))
 
-    still = torch.zeros_like(u)
+    still = u.new_zeros(()).expand_as(u)  # takes no memory
     aligned = None if affine is None else at(affine, still)
     return Evaluation(at(None, still), aligned, at(affine, u), regions and LABEL_MODE)
 
@@ -103,10 +103,16 @@ def _carried_labels(labels: Image, fixed: Image, affine: Affine | None, u: Tenso
 def _warped_labels(labels: Tensor, u: Tensor, grid: Grid) -> Tensor:
     """Return the labels ``(B or 1, 1, *S)`` of each item through its displacement, continued beyond the edge."""
     items = labels.expand(len(u), *labels.shape[1:]).split(1)
-    points = (grid.points(dtype=torch.float64, device=u.device) + u).split(1)
-    return torch.cat(
-        [interpolator(i, grid, mode=LABEL_MODE, outside=None)(p) for i, p in zip(items, points, strict=True)]
-    )
+    return torch.cat([_warped_item(item, w, grid) for item, w in zip(items, u.split(1), strict=True)])
+
+
+def _warped_item(labels: Tensor, u: Tensor, grid: Grid) -> Tensor:
+    at = interpolator(labels, grid, mode=LABEL_MODE, outside=None)
+
+    def values(rows: slice) -> Tensor:
+        return at(grid.points(dtype=torch.float64, device=u.device, rows=rows) + u[:, :, rows])
+
+    return over_slabs(values, grid, u.device)
 
 
 def _labels(guidance: Guidance) -> tuple[Tensor, Tensor] | None:
@@ -168,10 +174,13 @@ def dice(fixed: Tensor, warped: Tensor, labels: tuple[int, ...]) -> Tensor:
         ``(B, L)``, NaN where neither image has the label.
     """
     _require_same(fixed, warped, "dice")
-    a, b = ([(field == label).flatten(1) for label in labels] for field in (fixed, warped))
-    both = torch.stack([(x & y).sum(1) for x, y in zip(a, b, strict=True)], dim=1)
-    either = torch.stack([x.sum(1) + y.sum(1) for x, y in zip(a, b, strict=True)], dim=1)
-    return 2 * both.double() / either.double()
+    parts = [_overlap(fixed == label, warped == label) for label in labels]
+    return torch.stack(parts, dim=1) if parts else torch.empty(len(fixed), 0, dtype=torch.float64)
+
+
+def _overlap(a: Tensor, b: Tensor) -> Tensor:
+    both, first, second = (region.flatten(1).sum(1).double() for region in (a & b, a, b))
+    return 2 * both / (first + second)
 
 
 def hausdorff(

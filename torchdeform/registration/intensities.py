@@ -118,4 +118,4 @@ def _span(values: Tensor) -> Tensor:
 
 def _scaled(image: Tensor, span: Tensor) -> Tensor:
     low, high = (end.view(*end.shape, *([1] * (image.dim() - 2))) for end in span)
-    return (image - low) / torch.where(high > low, high - low, 1)
+    return (image - low).div_(torch.where(high > low, high - low, 1))

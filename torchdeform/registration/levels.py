@@ -169,6 +169,7 @@ def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> 
             break
         divergence = (settings.soft_determinant / lowest - 1).clamp_(min=0)
         v = _velocity(level, warped, gradient, divergence, pull)
+        del warped, gradient  # before the next are made
         pace = step_length(settings, step, steps) / level.sides
         move = v * column((_pace(pace, v, pull, level) * active).repeat(level.sides), v)
         share = (settings.elasticity * active).repeat(level.sides)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
+from torchdeform.grid import Grid, over_slabs
 from torchdeform.image import Image
 from torchdeform.registration.levels import climb_levels
 from torchdeform.registration.placing import Subject, place
@@ -58,12 +58,18 @@ def climb_from_middle(
     inner = middle.scene.grid
     halves = None if start is None else _split(_start_between(start, grid, middle), inner)
     halves, records = climb_levels(middle.scene, _half(settings), halves, callback)
-    nodes = grid.points(dtype=torch.float64, device=halves.device)
     to_fixed, to_moving = halves.chunk(2)
-    points = middle.from_fixed(nodes)
-    points = points + sample(invert(to_fixed, inner), points, inner)
-    points = points + sample(to_moving, points, inner)
-    return mended((middle.to_fixed(points) - nodes).to(halves), grid, settings.min_determinant), records
+    inverse = invert(to_fixed, inner)
+
+    def joined(rows: slice) -> Tensor:
+        nodes = grid.points(dtype=torch.float64, device=halves.device, rows=rows)
+        points = middle.from_fixed(nodes)
+        points = points + sample(inverse, points, inner)
+        points = points + sample(to_moving, points, inner)
+        return (middle.to_fixed(points) - nodes).to(halves)
+
+    u = over_slabs(joined, grid, halves.device)
+    return mended(u, grid, settings.min_determinant), records
 
 
 def _half(settings: RegistrationSettings) -> RegistrationSettings:
