@@ -1,4 +1,4 @@
-"""Matrices along the axes of a field whose rows have few entries, near one another: interpolation, smoothing."""
+"""Matrices along the axes of a field, with few entries a row, near one another: interpolation, smoothing, windows."""
 
 import math
 from collections.abc import Sequence
@@ -21,24 +21,31 @@ class Banded:
 
     Attributes:
         count: number of rows.
-        blocks: their first rows, first columns, and entries.
+        blocks: the first column and the entries ``(rows, columns)`` of each.
     """
 
     count: int
-    blocks: tuple[tuple[int, int, Tensor], ...]
+    blocks: tuple[tuple[int, Tensor], ...]
 
     def along(self, field: Tensor, axis: int) -> Tensor:
         """Return the product with every line of a field ``(B, C, *S)`` along an axis of the tensor.
 
         Notes:
-            The same order of summation in every run. Not differentiable.
+            The same order of summation in every run. Differentiable; where a gradient is wanted, with one more copy.
         """
-        found = field.new_empty(*field.shape[:axis], self.count, *field.shape[axis + 1 :])
-        source, target = (_lines(part, axis) for part in (field.contiguous(), found))
-        for row, column, entries in self.blocks:
-            rows, columns = entries.shape
-            block = entries.expand(len(source), rows, columns)
-            torch.bmm(block, source.narrow(1, column, columns), out=target.narrow(1, row, rows))
+        lines = _lines(field.contiguous(), axis)
+        factors = [
+            (entries.expand(len(lines), -1, -1), lines.narrow(1, first, entries.shape[1]))
+            for first, entries in self.blocks
+        ]
+        shape = (*field.shape[:axis], self.count, *field.shape[axis + 1 :])
+        if torch.is_grad_enabled() and field.requires_grad:
+            found = torch.cat([torch.bmm(*pair) for pair in factors], dim=1)
+            return (found[0].T if axis == field.dim() - 1 else found).reshape(shape)
+        found = field.new_empty(shape)
+        parts = _lines(found, axis).split([len(entries) for _, entries in self.blocks], dim=1)
+        for pair, part in zip(factors, parts, strict=True):
+            torch.bmm(*pair, out=part)
         return found
 
 
@@ -65,13 +72,13 @@ def interpolation(coarse: int, fine: int, like: Tensor) -> Banded | None:
         fine: number of nodes wanted.
         like: a tensor with the dtype and device wanted.
     """
-    return None if coarse == fine else _banded(*_linear(coarse, fine), fine, like)
+    return None if coarse == fine else banded(*_linear(coarse, fine), fine, like)
 
 
 def gathering(fine: int, coarse: int, like: Tensor) -> Banded | None:
     """Return the transpose of `interpolation`, divided by the number of fine intervals to a coarse one."""
     rows, columns, values = _linear(coarse, fine)
-    return None if coarse == fine else _banded(columns, rows, values * ((coarse - 1) / (fine - 1)), coarse, like)
+    return None if coarse == fine else banded(columns, rows, values * ((coarse - 1) / (fine - 1)), coarse, like)
 
 
 def restriction(fine: int, coarse: int, blur: float, like: Tensor) -> Banded | None:
@@ -90,7 +97,7 @@ def restriction(fine: int, coarse: int, blur: float, like: Tensor) -> Banded | N
     rows, columns, values = (part.unsqueeze(1) for part in _linear(fine, coarse))
     columns, values = (columns + offset).clamp(0, fine - 1), values * kernel
     flat = rows.expand_as(columns).flatten(), columns.flatten(), values.flatten()
-    return None if coarse == fine else _banded(*flat, coarse, like)
+    return None if coarse == fine else banded(*flat, coarse, like)
 
 
 def _linear(given: int, wanted: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -102,13 +109,22 @@ def _linear(given: int, wanted: int) -> tuple[Tensor, Tensor, Tensor]:
     return rows.repeat(2), torch.cat([left, left + 1]), torch.cat([1 - share, share])
 
 
-def _banded(rows: Tensor, columns: Tensor, values: Tensor, count: int, like: Tensor) -> Banded:
-    """Return the matrix with these entries, those of one place being added."""
+def banded(rows: Tensor, columns: Tensor, values: Tensor, count: int, like: Tensor) -> Banded:
+    """Return the matrix with the entries ``values`` in these rows and columns ``(n,)``, those of one place being added.
+
+    Args:
+        rows: whole numbers below ``count``.
+        columns: whole numbers, near one another in rows that are.
+        values: entries.
+        count: number of rows.
+        like: a tensor with the dtype and device wanted.
+    """
     blocks, size = [], _ROWS.get(like.device.type, 256)
-    for first in range(0, count, size):
-        here = (rows >= first) & (rows < first + size)
-        start = int(columns[here].min())
-        block = values.new_zeros(min(size, count - first), int(columns[here].max()) + 1 - start)
-        block.index_put_((rows[here] - first, columns[here] - start), values[here], accumulate=True)
-        blocks.append((first, start, block.to(like)))
+    for start in range(0, count, size):
+        here = (rows >= start) & (rows < start + size)
+        near = columns[here] if bool(here.any()) else columns.new_zeros(1)
+        first = int(near.min())
+        entries = values.new_zeros(min(size, count - start), int(near.max()) + 1 - first)
+        entries.index_put_((rows[here] - start, columns[here] - first), values[here], accumulate=True)
+        blocks.append((first, entries.to(like)))
     return Banded(count, tuple(blocks))
