@@ -66,5 +66,5 @@ def _windows(size: int, window: int, stride: int, dtype: torch.dtype, device: to
         nodes = middle + torch.arange(window) - window // 2
         inside = (nodes >= 0) & (nodes < size)
         rows, columns = torch.arange(len(middle)).unsqueeze(1).expand_as(nodes)[inside], nodes[inside]
-        ones = torch.ones(len(rows))
-        return banded(rows, columns, ones, len(middle), like), banded(columns, rows, ones, size, like)
+        ones, count = torch.ones(len(rows)), len(middle)
+        return banded(rows, columns, ones, (count, size), like), banded(columns, rows, ones, (size, count), like)
