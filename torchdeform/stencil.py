@@ -19,7 +19,7 @@ KERNELS: dict[int, tuple[tuple[float, ...], tuple[tuple[float, ...], ...]]] = {
 }
 
 # Rows of a slab at least, because the two next to it are computed with it.
-_LEAST_ROWS = 4
+LEAST_ROWS = 4
 
 # The curl in each dimension: component c is ∂_a u_b − ∂_b u_a for the c-th pair (a, b).
 CURL_PAIRS: dict[int, tuple[tuple[int, int], ...]] = {2: ((0, 1),), 3: ((1, 2), (2, 0), (0, 1))}
@@ -220,11 +220,12 @@ def by_slabs(function: Callable[[Tensor, Grid], Tensor], u: Tensor, grid: Grid) 
         u: ``(B, D, *S)``.
         grid: its grid.
     """
+    return over_slabs(lambda rows: slab_of(function, u, grid, rows), grid, u.device, least=LEAST_ROWS)
+
+
+def slab_of(function: Callable[[Tensor, Grid], Tensor], u: Tensor, grid: Grid, rows: slice) -> Tensor:
+    """Return some rows of function(u, grid), computed from them and those next to them; see `by_slabs`."""
     last = grid.shape[0]
-
-    def values(rows: slice) -> Tensor:
-        low, high = max(min(rows.start - 1, last - 3), 0), min(max(rows.stop + 1, 3), last)
-        part = Grid((high - low, *grid.shape[1:]), grid.spacing)
-        return function(u.narrow(2, low, high - low), part)[:, :, rows.start - low : rows.stop - low]
-
-    return over_slabs(values, grid, u.device, least=_LEAST_ROWS)
+    low, high = max(min(rows.start - 1, last - 3), 0), min(max(rows.stop + 1, 3), last)
+    part = Grid((high - low, *grid.shape[1:]), grid.spacing)
+    return function(u.narrow(2, low, high - low), part)[:, :, rows.start - low : rows.stop - low]

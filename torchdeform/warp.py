@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Literal, overload
 
 import torch
@@ -9,8 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.errors import InputError, require_choice
-from torchdeform.grid import Grid
-from torchdeform.stencil import cofactors, derivative, determinant, map_jacobian
+from torchdeform.grid import Grid, over_slabs
+from torchdeform.stencil import LEAST_ROWS, cofactors, derivative, determinant, map_jacobian, slab_of
 
 _RESIZE = {2: "bilinear", 3: "trilinear"}
 _MODES = {"linear": "bilinear", "nearest": "nearest"}
@@ -31,6 +32,9 @@ _COMMON_STEPS = 2
 
 # Steps for which the D² entries of ∇φ⁻¹, the dearest part of a step, are kept.
 _REFRESH = 3
+
+# Nodes that are taken further at once, where they are not all of a slab.
+_NODES_AT_ONCE = 2**20
 
 # How often nodes that Newton's method lost start again from their neighbours.
 _RESTARTS = 8
@@ -85,10 +89,16 @@ def warp(image: Tensor, u: Tensor, grid: Grid, *, mode: str = "linear", outside:
     """
     grid.check(image, "warp: image")
     grid.check_vector(u, "warp: u")
-    values = _sample(image, _normalise(_lines(grid, u), u, grid), mode)
+    values = _pulled(image, u, grid, slice(None), mode)
     if outside is None:
         return values
     return torch.where(_inside(grid.points(dtype=u.dtype, device=u.device) + u, grid), values, outside)
+
+
+def _pulled(image: Tensor, u: Tensor, grid: Grid, rows: slice, mode: str = "linear") -> Tensor:
+    """Return image(x + u(x)) for the nodes x in some rows of the first axis, u being given there."""
+    first, *others = _lines(grid, u)
+    return _sample(image, _normalise([first[rows], *others], u, grid), mode)
 
 
 def _lines(grid: Grid, like: Tensor) -> list[Tensor]:
@@ -253,40 +263,58 @@ def _resized(u: Tensor, grid: Grid) -> Tensor:
 
 def _approach(u: Tensor, w: Tensor, grid: Grid, atol: float) -> Tensor:
     """Take a few steps δw = −(I + ∇w) d of Newton's method, d being the defect and I + ∇w = ∇φ⁻¹ once w is near."""
-    defect = compose(u, w, grid)
-    error = voxels(defect, grid)
+
+    def start(rows: slice) -> Tensor:
+        part = w[:, :, rows]
+        return torch.cat([part, part + _pulled(u, part, grid, rows)], dim=1)
+
+    state = over_slabs(start, grid, w.device)
     for _ in range(_COMMON_STEPS):
-        trial = w - defect
-        for axis in range(grid.dim):
-            trial.addcmul_(derivative(w, grid, axis), defect[:, axis : axis + 1], value=-1)
-        trial_defect = compose(u, trial, grid)
-        trial_error = voxels(trial_defect, grid)
-        nearer = (error > atol) & (trial_error < error)
-        w, defect = torch.where(nearer, trial, w), torch.where(nearer, trial_defect, defect)
-        error = torch.where(nearer, trial_error, error)
-    return w
+        state = over_slabs(partial(_nearer, u, state, grid, atol), grid, w.device, least=LEAST_ROWS)
+    return state[:, : grid.dim]
+
+
+def _nearer(u: Tensor, state: Tensor, grid: Grid, atol: float, rows: slice) -> Tensor:
+    """Return w and its defect ``(B, 2D, *T)`` in some rows after a step, where that brings them nearer."""
+    w, defect = state[:, :, rows].chunk(2, dim=1)
+    slopes = (slab_of(partial(derivative, axis=k), state[:, : grid.dim], grid, rows) for k in range(grid.dim))
+    trial = w - defect
+    for axis, slope in enumerate(slopes):
+        trial.addcmul_(slope, defect[:, axis : axis + 1], value=-1)
+    trial_defect = trial + _pulled(u, trial, grid, rows)
+    error = voxels(defect, grid)
+    nearer = (error > atol) & (voxels(trial_defect, grid) < error)
+    return torch.where(nearer, torch.cat([trial, trial_defect], dim=1), state[:, :, rows])
 
 
 def _finished(u: Tensor, w: Tensor, grid: Grid, atol: float, max_steps: int) -> Tensor:
     """Return w of one item after Newton's method where it is needed; lost nodes start again from their neighbours."""
     w = w.clone()
-    error = voxels(compose(u, w, grid), grid)
+    error = over_slabs(lambda rows: voxels(w[:, :, rows] + _pulled(u, w[:, :, rows], grid, rows), grid), grid, w.device)
     for attempt in range(1 + _RESTARTS):
         lost = error > atol
         places = lost.flatten().nonzero()[:, 0]
         if len(places) == 0 or (attempt and len(places) == lost.numel()):
             break
         start = _mean_of_neighbours(w, ~lost) if attempt else w
-        strides = [math.prod(grid.shape[k + 1 :]) for k in range(grid.dim)]
-        lines = zip(_lines(grid, w), strides, grid.shape, strict=True)
-        nodes = torch.stack([line.flatten()[places // stride % n] for line, stride, n in lines]).unsqueeze(0)
-        found, reached = _newton(u, grid, nodes, start.flatten(2)[..., places], atol, max_steps)
+        parts = [
+            _newton(u, grid, _nodes_at(some, grid, w), start.flatten(2)[..., some], atol, max_steps)
+            for some in places.split(_NODES_AT_ONCE)
+        ]
+        found, reached = (torch.cat(part, dim=2) for part in zip(*parts, strict=True))
         nearer = reached < error.flatten(2)[..., places]
         if not bool(nearer.any()):
             break
         w.flatten(2)[..., places] = torch.where(nearer, found, w.flatten(2)[..., places])
         error.flatten(2)[..., places] = torch.where(nearer, reached, error.flatten(2)[..., places])
     return w
+
+
+def _nodes_at(places: Tensor, grid: Grid, like: Tensor) -> Tensor:
+    """Return nodes of grid_sample's box ``(1, D, N)`` by their places in the flattened grid."""
+    strides = [math.prod(grid.shape[k + 1 :]) for k in range(grid.dim)]
+    lines = zip(_lines(grid, like), strides, grid.shape, strict=True)
+    return torch.stack([line.flatten()[places // stride % n] for line, stride, n in lines]).unsqueeze(0)
 
 
 def _newton(u: Tensor, grid: Grid, nodes: Tensor, w: Tensor, atol: float, max_steps: int) -> tuple[Tensor, Tensor]:
