@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
 from torchdeform.errors import InputError
@@ -168,10 +168,17 @@ def from_values(values: NDArray[np.generic], place: Image) -> "sitk.Image":
     return itk
 
 
-def to_world_vectors(u: Tensor, place: Image) -> NDArray[np.float64]:
-    """Return u ``(1, D, *S)`` (array order, units of spacing) as ITK's vectors ``(D, *S)``: direction · (x, y, z)."""
-    vectors = u[0].detach().cpu().to(torch.float64).flip(0).numpy()
-    return np.einsum("ij,j...->i...", _matrix(place.direction), vectors)
+def to_world_vectors(u: Tensor, place: Image, kind: DTypeLike = np.float64) -> NDArray[np.floating]:
+    """Return u ``(1, D, *S)`` (array order, units of spacing) as ITK's vectors ``(D, *S)``: direction · (x, y, z).
+
+    They are computed in float64 and lie in memory as ITK has them, one node's vector after another's.
+    """
+    dim, shape = place.grid.dim, place.grid.shape
+    found = np.empty((*shape, dim), dtype=kind)
+    for rows in place.grid.slabs(u.device):
+        vectors = u[0, :, rows].detach().cpu().to(torch.float64).flip(0).numpy()
+        found[rows] = np.einsum("ij,j...->...i", _matrix(place.direction), vectors)
+    return np.moveaxis(found, -1, 0)
 
 
 def to_grid_vectors(vectors: Tensor, place: Image) -> Tensor:

@@ -48,7 +48,8 @@ def write_displacement(u: Tensor, fixed: Image, path: _Path) -> None:
         image whose value belongs there, as in ITK and ANTs. float32.
     """
     file = Path(path)
-    field = _world_field(u, fixed, "write_displacement: u").astype(np.float32)
+    _check_field(u, fixed, "write_displacement: u")
+    field = itk.to_world_vectors(u, fixed, np.float32)
     with staged(file.parent) as folder:
         itk.save(itk.from_values(field, fixed), folder / file.name)
 
@@ -240,11 +241,6 @@ def _save(transform: "sitk.Transform", path: Path) -> None:
                 sitk.WriteTransform(transform, str(folder / path.name))
         except RuntimeError as error:
             raise InputError(f"{path} cannot be written: {itk.reason(error)}; use the ending .h5") from error
-
-
-def _world_field(u: Tensor, fixed: Image, name: str) -> "np.ndarray[tuple[int, ...], np.dtype[np.float64]]":
-    _check_field(u, fixed, name)
-    return itk.to_world_vectors(u, fixed)
 
 
 def _check_field(u: Tensor, fixed: Image, name: str) -> None:
