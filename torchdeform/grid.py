@@ -73,12 +73,6 @@ class Grid:
         """Return D numbers as a ``(1, D, 1, ..)`` tensor that broadcasts over a vector field like ``like``."""
         return torch.as_tensor(values, dtype=like.dtype, device=like.device).view(1, self.dim, *([1] * self.dim))
 
-    def slabs(self, device: torch.device, *, least: int = 1) -> Iterator[slice]:
-        """Yield the rows of the first axis, a slab of at least so many at a time, for what needs much memory a node."""
-        rows = max(least, _SLAB_NODES.get(device.type, 2**22) // math.prod(self.shape[1:]))
-        for start in range(0, self.shape[0], rows):
-            yield slice(start, min(start + rows, self.shape[0]))
-
     def points(
         self,
         *,
@@ -129,12 +123,21 @@ class Grid:
         self.check(field, name, components=1)
 
 
-def over_slabs(values: Callable[[slice], Tensor], grid: Grid, device: torch.device, *, least: int = 1) -> Tensor:
+def slabs(shape: Sequence[int], device: torch.device, *, least: int = 1) -> Iterator[slice]:
+    """Yield the rows of the first axis, a slab of at least so many at a time, for what needs much memory a node."""
+    rows = max(least, _SLAB_NODES.get(device.type, 2**22) // math.prod(shape[1:]))
+    for start in range(0, shape[0], rows):
+        yield slice(start, min(start + rows, shape[0]))
+
+
+def over_slabs(
+    values: Callable[[slice], Tensor], shape: Sequence[int], device: torch.device, *, least: int = 1
+) -> Tensor:
     """Return what a function of rows of the first axis has to say, ``(B, C, *T)`` each, for all of them together.
 
     Args:
         values: of the rows of a slab.
-        grid: the grid they belong to.
+        shape: of all nodes.
         device: where the values are made.
         least: rows of a slab at least.
 
@@ -142,11 +145,11 @@ def over_slabs(values: Callable[[slice], Tensor], grid: Grid, device: torch.devi
         Slabs are copied into place as they come. Where a gradient is wanted they are joined at the end: it would be
         copied as a whole for every slab otherwise.
     """
-    parts = map(values, grid.slabs(device, least=least))
+    parts = map(values, slabs(shape, device, least=least))
     first = next(parts)
     if first.requires_grad:
         return torch.cat([first, *parts], dim=2)
-    whole, start = first.new_empty(*first.shape[:2], grid.shape[0], *first.shape[3:]), 0
+    whole, start = first.new_empty(*first.shape[:2], shape[0], *first.shape[3:]), 0
     for part in chain((first,), parts):
         whole.narrow(2, start, part.shape[2]).copy_(part)
         start += part.shape[2]

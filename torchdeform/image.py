@@ -102,7 +102,7 @@ def resample(
         points = points if u is None else points + u[:, :, rows]
         return sample(moving.data, moving.to_grid(fixed.to_world(points)), moving.grid, mode=mode, outside=outside)
 
-    return over_slabs(values, grid, device)
+    return over_slabs(values, grid.shape, device)
 
 
 def same_place(a: Image, b: Image) -> bool:

@@ -220,7 +220,7 @@ def by_slabs(function: Callable[[Tensor, Grid], Tensor], u: Tensor, grid: Grid) 
         u: ``(B, D, *S)``.
         grid: its grid.
     """
-    return over_slabs(lambda rows: slab_of(function, u, grid, rows), grid, u.device, least=LEAST_ROWS)
+    return over_slabs(lambda rows: slab_of(function, u, grid, rows), grid.shape, u.device, least=LEAST_ROWS)
 
 
 def slab_of(function: Callable[[Tensor, Grid], Tensor], u: Tensor, grid: Grid, rows: slice) -> Tensor:

@@ -445,4 +445,4 @@ def _over_nodes(place: Image, function: Callable[[Tensor], Tensor], device: torc
     def values(rows: slice) -> Tensor:
         return function(place.to_world(place.grid.points(dtype=torch.float64, device=device, rows=rows)))
 
-    return over_slabs(values, place.grid, device)
+    return over_slabs(values, place.grid.shape, device)

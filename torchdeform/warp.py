@@ -268,9 +268,9 @@ def _approach(u: Tensor, w: Tensor, grid: Grid, atol: float) -> Tensor:
         part = w[:, :, rows]
         return torch.cat([part, part + _pulled(u, part, grid, rows)], dim=1)
 
-    state = over_slabs(start, grid, w.device)
+    state = over_slabs(start, grid.shape, w.device)
     for _ in range(_COMMON_STEPS):
-        state = over_slabs(partial(_nearer, u, state, grid, atol), grid, w.device, least=LEAST_ROWS)
+        state = over_slabs(partial(_nearer, u, state, grid, atol), grid.shape, w.device, least=LEAST_ROWS)
     return state[:, : grid.dim]
 
 
@@ -290,7 +290,11 @@ def _nearer(u: Tensor, state: Tensor, grid: Grid, atol: float, rows: slice) -> T
 def _finished(u: Tensor, w: Tensor, grid: Grid, atol: float, max_steps: int) -> Tensor:
     """Return w of one item after Newton's method where it is needed; lost nodes start again from their neighbours."""
     w = w.clone()
-    error = over_slabs(lambda rows: voxels(w[:, :, rows] + _pulled(u, w[:, :, rows], grid, rows), grid), grid, w.device)
+
+    def miss(rows: slice) -> Tensor:
+        return voxels(w[:, :, rows] + _pulled(u, w[:, :, rows], grid, rows), grid)
+
+    error = over_slabs(miss, grid.shape, w.device)
     for attempt in range(1 + _RESTARTS):
         lost = error > atol
         places = lost.flatten().nonzero()[:, 0]

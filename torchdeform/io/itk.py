@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
+from torchdeform.grid import Grid, slabs
 from torchdeform.image import Image
 from torchdeform.io.complaints import BROKEN_OFF, NOT_SQUARE
 from torchdeform.io.files import native_stderr
@@ -175,7 +175,7 @@ def to_world_vectors(u: Tensor, place: Image, kind: DTypeLike = np.float64) -> N
     """
     dim, shape = place.grid.dim, place.grid.shape
     found = np.empty((*shape, dim), dtype=kind)
-    for rows in place.grid.slabs(u.device):
+    for rows in slabs(shape, u.device):
         vectors = u[0, :, rows].detach().cpu().to(torch.float64).flip(0).numpy()
         found[rows] = np.einsum("ij,j...->...i", _matrix(place.direction), vectors)
     return np.moveaxis(found, -1, 0)

@@ -112,7 +112,7 @@ def _warped_item(labels: Tensor, u: Tensor, grid: Grid) -> Tensor:
     def values(rows: slice) -> Tensor:
         return at(grid.points(dtype=torch.float64, device=u.device, rows=rows) + u[:, :, rows])
 
-    return over_slabs(values, grid, u.device)
+    return over_slabs(values, grid.shape, u.device)
 
 
 def _labels(guidance: Guidance) -> tuple[Tensor, Tensor] | None:

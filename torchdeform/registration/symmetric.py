@@ -68,7 +68,7 @@ def climb_from_middle(
         points = points + sample(to_moving, points, inner)
         return (middle.to_fixed(points) - nodes).to(halves)
 
-    u = over_slabs(joined, grid, halves.device)
+    u = over_slabs(joined, grid.shape, halves.device)
     return mended(u, grid, settings.min_determinant), records
 
 

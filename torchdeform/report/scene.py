@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchdeform.grid import Grid
+from torchdeform.grid import Grid, over_slabs
 from torchdeform.image import Image, luminance
 from torchdeform.registration.result import RegistrationResult
 from torchdeform.report.planes import Plane, planes_of
@@ -152,14 +152,24 @@ class _Eyes:
     def _error(self, plane: Plane, points: Tensor, numbers: Sequence[int]) -> Tensor:
         """Return |w(x) + u(x + w(x))| in voxels."""
         back = plane.chosen(self._inverse, numbers)
-        return plane.arrange(voxels(back + sample(self._u, points + back, plane.grid), plane.grid))
+
+        def error(rows: slice) -> Tensor:
+            part = back[:, :, rows]
+            return voxels(part + sample(self._u, points[:, :, rows] + part, plane.grid), plane.grid)
+
+        return plane.arrange(over_slabs(error, points.shape[2:], points.device))
 
 
 def seen(values: Tensor, image: Image, fixed: Image, points: Tensor, affine: Affine | None = None) -> Tensor:
     """Return values on an image's grid at points of the fixed grid, where ``affine`` takes them; 0 outside."""
-    world = fixed.to_world(points)
-    place = image.to_grid(world if affine is None else affine(world))
-    return sample(values.float(), place, image.grid, outside=0.0)
+    values = values.float()
+
+    def at(rows: slice) -> Tensor:
+        world = fixed.to_world(points[:, :, rows])
+        place = image.to_grid(world if affine is None else affine(world))
+        return sample(values, place, image.grid, outside=0.0)
+
+    return over_slabs(at, points.shape[2:], points.device)
 
 
 def log_volume(det: Tensor) -> Tensor:
