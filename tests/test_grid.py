@@ -8,8 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchdeform import grid as module
 from torchdeform.errors import ComputationError, InputError, TorchdeformError, nearest_name, require_choice
-from torchdeform.grid import Grid
+from torchdeform.grid import Grid, over_slabs, slabs
 
 SHAPES = st.integers(2, 3).flatmap(lambda dim: st.tuples(*[st.integers(2, 9)] * dim))
 SPACINGS = st.floats(0.01, 100)
@@ -121,3 +122,26 @@ def test_errors_say_what_was_meant():
         require_choice(3, (2, 4), "order")
     with pytest.raises(InputError, match=r"^mode must be .* got 'linaer'; did you mean 'linear'\?$"):
         require_choice("linaer", ("linear", "nearest"), "mode")
+
+
+@given(SHAPES, st.integers(1, 200), st.integers(1, 4))
+def test_slabs_are_all_rows_in_order(shape, nodes, least):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_SLAB_NODES", {"cpu": nodes})
+        rows = list(slabs(shape, torch.device("cpu"), least=least))
+    assert [k for part in rows for k in range(part.start, part.stop)] == list(range(shape[0]))
+    assert all(part.stop - part.start >= least for part in rows[:-1])
+    assert all(
+        (part.stop - part.start) * math.prod(shape[1:]) <= nodes or part.stop - part.start <= least for part in rows
+    )
+
+
+def test_over_slabs_is_the_whole_and_so_is_its_gradient(monkeypatch):
+    monkeypatch.setattr(module, "_SLAB_NODES", {"cpu": 1})
+    grid, field = Grid((5, 4, 3), (1.0, 2.0, 0.5)), torch.rand(1, 2, 5, 4, 3, requires_grad=True)
+    whole = over_slabs(lambda rows: field[:, :, rows] ** 2, grid.shape, field.device)
+    torch.testing.assert_close(whole, field**2)
+    torch.testing.assert_close(torch.autograd.grad(whole.sum(), field)[0], 2 * field)
+    assert not over_slabs(lambda rows: field.detach()[:, :, rows], grid.shape, field.device).requires_grad
+    points = over_slabs(lambda rows: grid.points(rows=rows), grid.shape, field.device)
+    assert torch.equal(points, grid.points())

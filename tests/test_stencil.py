@@ -10,10 +10,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
+from torchdeform import grid as module
 from torchdeform.errors import InputError
 from torchdeform.grid import Grid
 from torchdeform.stencil import (
     KERNELS,
+    by_slabs,
     cofactors,
     curl,
     derivative,
@@ -165,6 +167,15 @@ def test_a_batch_equals_its_items(function, dtype, device):
     assert (together.dtype, together.device.type) == (dtype, device)
     for item, one in zip(u, together, strict=True):
         assert torch.equal(function(item[None], grid, 4)[0], one)
+
+
+@pytest.mark.parametrize("shape", [(3, 6), (4, 5), (9, 4), (3, 4, 5), (13, 4, 5)])
+def test_slabs_do_not_show(shape, monkeypatch):
+    monkeypatch.setattr(module, "_SLAB_NODES", {"cpu": 1})
+    grid = Grid(shape, (0.5, 2.0, 1.2)[: len(shape)])
+    u = random_field(grid, len(shape), items=2)
+    for function in (jacobian_determinant, divergence, lambda u, g: map_jacobian(u, g).flatten(1, 2)):
+        assert torch.equal(by_slabs(function, u, grid), function(u, grid))
 
 
 def test_wrong_input_is_refused():

@@ -30,18 +30,18 @@ _LIMITS = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.u
 # Measured by ``scripts/benchmarks/memory.py``: bytes of a process that has imported everything; per node of the fixed
 # grid, whatever the similarity; and per node and channel of the images, by similarity. By dimension.
 _PROCESS_BYTES = 4.5e8
-_PER_NODE = {2: 100.0, 3: 230.0}
+_PER_NODE = {2: 100.0, 3: 80.0}
 _PER_CHANNEL = {
-    "ssd": {2: 20.0, 3: 20.0},
-    "ncc": {2: 20.0, 3: 20.0},
-    "lncc": {2: 140.0, 3: 80.0},
-    "mi": {2: 75.0, 3: 55.0},
-    "nmi": {2: 75.0, 3: 55.0},
-    "ngf": {2: 60.0, 3: 20.0},
-    "mind": {2: 125.0, 3: 230.0},
+    "ssd": {2: 60.0, 3: 55.0},
+    "ncc": {2: 60.0, 3: 55.0},
+    "lncc": {2: 45.0, 3: 40.0},
+    "mi": {2: 60.0, 3: 50.0},
+    "nmi": {2: 60.0, 3: 50.0},
+    "ngf": {2: 75.0, 3: 60.0},
+    "mind": {2: 140.0, 3: 300.0},
 }
 # The same of a discrete start, whatever the similarity: per node, and per node and channel. What holds more counts.
-_DISCRETE = {2: (200.0, 110.0), 3: (270.0, 90.0)}
+_DISCRETE = {2: (130.0, 75.0), 3: (100.0, 65.0)}
 
 
 def estimate(
@@ -60,7 +60,7 @@ def estimate(
 
     Notes:
         Affine in the number of nodes; coarser levels are smaller by 2^D and do not count. Measured in float32 on a CPU,
-        within 25 % from 64³ to 160³ and from 512² to 2048².
+        within 25 % from 64³ to 256³ and from 512² to 4096², and rather more than is taken beyond.
     """
     require_choice(start, STARTS, "start")
     per_channel = sum(_PER_CHANNEL[name][grid.dim] for name in similarity_weights(similarity))

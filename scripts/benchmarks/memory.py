@@ -16,9 +16,9 @@ ROOT = Path(__file__).resolve().parents[2]
 # Dimension, voxels along an axis, channels, similarity, start.
 QUICK = ((2, 512, 1, "lncc", "identity"), (3, 64, 1, "lncc", "identity"), (3, 96, 1, "ssd", "discrete"))
 CASES = (
-    *((2, n, 1, "lncc", "identity") for n in (512, 1024, 2048)),
+    *((2, n, 1, "lncc", "identity") for n in (512, 1024, 2048, 4096)),
     *((2, 1024, c, s, "identity") for c, s in ((1, "ssd"), (1, "mi"), (1, "ngf"), (1, "mind"), (3, "lncc"))),
-    *((3, n, 1, "lncc", "identity") for n in (64, 96, 128, 160)),
+    *((3, n, 1, "lncc", "identity") for n in (64, 96, 128, 160, 256)),
     *((3, 96, c, s, "identity") for c, s in ((1, "ssd"), (1, "ncc"), (1, "mi"), (1, "ngf"), (1, "mind"), (3, "lncc"))),
     *((2, n, 1, "lncc", "discrete") for n in (512, 1024, 1536)),
     *((3, n, c, s, "discrete") for n, c, s in ((64, 1, "lncc"), (96, 1, "ssd"), (96, 3, "lncc"), (128, 1, "lncc"))),
