@@ -28,7 +28,7 @@ _STEPS = (1, 1, 3)  # the first step of a level also looks at where it starts
 _FLOATS, _BYTES, _LARGEST = 40, 12 * 2**30, (8192, 8192)
 _QUICK = ((32, 32, 32), (48, 48, 48), (256, 256), (512, 512))
 _SHAPES = (*((n,) * 3 for n in (64, 96, 128, 192, 256, 384)), *((n,) * 2 for n in (512, 1024, 2048, 4096, 8192)))
-_NEEDED = 100 * 4  # bytes a voxel that must be free before a size is tried
+_NEEDED = 50 * 4  # bytes a voxel that must be free before a size is tried
 
 Shape = tuple[int, ...]
 
