@@ -423,6 +423,7 @@ TOOLS: dict[str, Tool] = {
     "torchdeform": _torchdeform("default"),
     "torchdeform_fast": _torchdeform("fast"),
     "torchdeform_accurate": _torchdeform("accurate"),
+    "torchdeform_smooth": _torchdeform("smooth"),
     "greedy": _Greedy("NMI", "NCC 2x2x2", moments=1).tool(),
     "greedy_centres": _Greedy("NMI", "NCC 2x2x2").tool(),
     "greedy_ncc": _Greedy("NCC 2x2x2", "NCC 2x2x2").tool(),
