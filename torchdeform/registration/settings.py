@@ -81,7 +81,7 @@ class RegistrationSettings:
     power: int = 1
     steps: tuple[int, ...] = (60, 60, 60)
     step_length: float = 0.5
-    tolerance: float = 0.01
+    tolerance: float = 0.03
     map_spacing: float = 2.0
     soft_determinant: float = 0.15
     min_determinant: float = 0.03
