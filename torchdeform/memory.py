@@ -42,6 +42,8 @@ _PER_CHANNEL = {
 }
 # The same of a discrete start, whatever the similarity: per node, and per node and channel. What holds more counts.
 _DISCRETE = {2: (130.0, 75.0), 3: (100.0, 65.0)}
+# And of reading, joining, judging and writing on the fixed grid, however coarse the finest level is.
+_FILES = {2: (65.0, 48.0), 3: (80.0, 26.0)}
 
 
 def estimate(
@@ -64,11 +66,14 @@ def estimate(
     """
     require_choice(start, STARTS, "start")
     per_channel = sum(_PER_CHANNEL[name][grid.dim] for name in similarity_weights(similarity))
-    per_node = _PER_NODE[grid.dim] + channels * per_channel
-    if start == "discrete":
-        node, channel = _DISCRETE[grid.dim]
-        per_node = max(per_node, node + channels * channel)
-    return round(_PROCESS_BYTES + per_node * math.prod(grid.shape))
+    rates = [(_PER_NODE[grid.dim], per_channel), *([_DISCRETE[grid.dim]] if start == "discrete" else [])]
+    return max(_affine(grid, channels, rate) for rate in rates)
+
+
+def _affine(grid: Grid, channels: int, rate: tuple[float, float]) -> int:
+    """Return the bytes of a process that holds so many for a node, and so many for a node and channel."""
+    node, channel = rate
+    return round(_PROCESS_BYTES + (node + channels * channel) * math.prod(grid.shape))
 
 
 def available(device: torch.device | str = "cpu") -> int | None:
@@ -162,19 +167,20 @@ def fitting_grid(
         start: ``identity`` or ``discrete``, likewise.
 
     Raises:
-        InputError: not even the coarsest grid fits.
+        InputError: files of this size take more, however coarse the finest level is.
 
     Notes:
         Voxels become larger until it fits, the small ones of thick slices first, as in `pyramid_grids`.
     """
-    size = min(grid.spacing)
-    coarser = grid
-    while (need := estimate(coarser, channels=channels, similarity=similarity, start=start)) > limit:
+    how = {"channels": channels, "similarity": similarity, "start": start}
+    least = min(_affine(grid, channels, _FILES[grid.dim]), estimate(grid, **how))
+    if limit < least:
+        raise InputError(
+            f"--memory {readable(limit, spaced=False)} is too little for a fixed image of "
+            f"{'×'.join(map(str, grid.shape[::-1]))}: give at least {readable(least, spaced=False)}, or resample it"
+        )
+    size, coarser = min(grid.spacing), grid
+    while estimate(coarser, **how) > limit and max(coarser.shape) > MIN_NODES:
         size /= _SHRINK
         coarser = with_voxels(grid, size)
-        if max(coarser.shape) <= MIN_NODES:
-            raise InputError(
-                f"--memory {readable(limit, spaced=False)} is too little for any image: give at least "
-                f"{readable(need, spaced=False)}"
-            )
     return coarser
