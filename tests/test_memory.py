@@ -40,7 +40,7 @@ def test_more_takes_more(dim):
     assert estimate(small, channels=9, similarity={"lncc": 1.0, "mind": 0.5}) == estimate(
         small, channels=9, similarity={"lncc": 1.0, "mind": 0.5}, start="discrete"
     )  # the climb holds more
-    finest = fitting_grid(large, 500_000_000, similarity="ssd", start="discrete")
+    finest = fitting_grid(large, 560_000_000, similarity="ssd", start="discrete")
     assert estimate(finest, similarity="ssd", start="discrete") <= 560_000_000
 
 
