@@ -196,14 +196,16 @@ def test_costs_grow_with_size_steps_and_number(tmp_path):
     small, large = _job(tmp_path, (32, 32)), _job(tmp_path, (64, 64, 64))
     slow, tight = (
         _job(tmp_path, (32, 32), settings={"symmetric": True}),
-        _job(tmp_path, (64, 64, 64), memory=460_000_000),
+        _job(tmp_path, (64, 64, 64), memory=480_000_000),
     )
+    refused = _job(tmp_path, (64, 64, 64), memory=460_000_000)
     one, two, both = estimate([small]), estimate([large]), estimate([small, large])
     assert one.seconds < two.seconds < both.seconds == pytest.approx(one.seconds + two.seconds)
     assert one.memory < two.memory == both.memory
     assert estimate([slow]).seconds > one.seconds
     assert estimate([tight]).seconds < two.seconds
-    assert estimate([tight]).memory <= 460_000_000
+    assert estimate([tight]).memory <= 480_000_000
+    assert (estimate([refused]).seconds, estimate([refused]).unknown) == (0, 1)
 
 
 def test_costs_of_files_that_say_nothing_are_unknown(tmp_path):

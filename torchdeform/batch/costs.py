@@ -7,15 +7,17 @@ from functools import cache
 
 from torchdeform.batch.job import Job
 from torchdeform.batch.needs import measure, size_of
+from torchdeform.errors import InputError
 from torchdeform.grid import Grid
 from torchdeform.memory import fitting_grid
+from torchdeform.registration.levels import steps_on
 from torchdeform.registration.pyramid import pyramid_grids
 from torchdeform.registration.settings import similarity_weights
 
 # Seconds of one core of an x86 server: of a pair, whatever its size; and per node, step and channel, by dimension, with
 # LNCC and with the other similarities beside it.
 _PAIR = 1.5
-_PER_NODE_STEP = {2: 3e-7, 3: 9e-7}
+_PER_NODE_STEP = {2: 2e-7, 3: 3e-7}
 _BESIDE_LNCC = {"ssd": 0.7, "ncc": 0.7, "lncc": 1.0, "mi": 1.1, "nmi": 1.1, "ngf": 1.0, "mind": 1.5}
 
 
@@ -26,7 +28,8 @@ class Costs:
     Attributes:
         seconds: of all pairs, one after another, on one core.
         memory: bytes of the largest.
-        unknown: number of pairs whose size the files do not say, which do not count.
+        unknown: number of pairs whose size the files do not say, or for which the limit of memory is too small; they
+            do not count.
     """
 
     seconds: float
@@ -57,9 +60,12 @@ def _seconds(job: Job, size: tuple[tuple[int, ...], int] | None) -> float | None
     (shape, channels), settings = size, job.settings
     grid, maps = Grid(shape), 2 if settings.symmetric else 1
     if job.memory is not None:
-        grid = fitting_grid(grid, job.memory // maps, channels=channels, similarity=settings.similarity)
+        try:
+            grid = fitting_grid(grid, job.memory // maps, channels=channels, similarity=settings.similarity)
+        except InputError:  # the pair itself will say so
+            return None
     levels = pyramid_grids(grid, len(settings.steps))
     steps = settings.steps[len(settings.steps) - len(levels) :]
-    node_steps = sum(math.prod(level.shape) * count for level, count in zip(levels, steps, strict=True))
+    node_steps = sum(math.prod(g.shape) * steps_on(g, n, settings) for g, n in zip(levels, steps, strict=True))
     beside = sum(_BESIDE_LNCC[name] for name in similarity_weights(settings.similarity))
     return _PAIR + maps * channels * beside * _PER_NODE_STEP[grid.dim] * node_steps

@@ -122,6 +122,11 @@ def metric_weights(grid: Grid, settings: RegistrationSettings, below: int) -> We
     return Weights(div=settings.weight_div, curl=settings.weight_curl, zero=held)
 
 
+def steps_on(grid: Grid, steps: int, settings: RegistrationSettings) -> int:
+    """Return the steps of a level of images on this grid: a coarser map is found map_spacing² times as soon."""
+    return steps if _map_grid(grid, settings) == grid else math.ceil(steps / settings.map_spacing**2)
+
+
 def _map_grid(grid: Grid, settings: RegistrationSettings) -> Grid:
     """Return the grid that carries the map of images on ``grid``."""
     return thinned(grid, settings.map_spacing) if math.prod(grid.shape) > _LARGE else grid
@@ -150,7 +155,7 @@ def _make_level(index: int, below: int, scene: Scene, settings: RegistrationSett
 def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> tuple[Tensor, LevelRecord]:
     """Climb one level; every pair ends at the best maps it met."""
     start, shortened, settings = perf_counter(), 0, level.settings
-    steps = _steps(level, settings.steps[level.index - levels])
+    steps = steps_on(level.comparison.grid, settings.steps[level.index - levels], settings)
     best, values, tops = u, [], []
     top = u.new_full((len(u) // level.sides,), -torch.inf)
     active, lowest = torch.ones_like(top, dtype=torch.bool), lowest_determinant(u, level.grid)
@@ -177,11 +182,6 @@ def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> 
         active &= moved
         shortened += short
     return best, LevelRecord(level.comparison.grid.shape, tuple(values), shortened, perf_counter() - start)
-
-
-def _steps(level: _Level, steps: int) -> int:
-    """Return the steps of a level: a coarser map has less to find, in map_spacing² times fewer steps."""
-    return steps if level.transfer is None else math.ceil(steps / level.settings.map_spacing**2)
 
 
 def _stalled(tops: list[Tensor], tolerance: float) -> Tensor:
