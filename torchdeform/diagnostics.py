@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchdeform.grid import Grid
+from torchdeform.grid import Grid, slabs
 from torchdeform.stencil import CURL_PAIRS, by_slabs, jacobian_determinant
 from torchdeform.warp import compose, voxels
 
@@ -25,9 +25,7 @@ _FRAMES = {
     ),
 }
 
-# Nodes computed at once: few enough that a CPU's cache holds every temporary, many enough that a GPU is busy. A slab
-# has some rows at least, because its two outer rows are computed twice.
-_SLAB_NODES = {"cpu": 2**17, "cuda": 2**22}
+# A slab has some rows at least, because its two outer rows are computed twice.
 _SLAB_ROWS = 4
 
 # Determinants are raised to this before their logarithm is taken.
@@ -190,10 +188,9 @@ def _lowest_by_slab(u: Tensor, grid: Grid) -> Iterator[Tensor]:
     A slab is valid until the next one is asked for: all use the same memory, because the page faults of fresh
     temporaries take longer than the arithmetic.
     """
-    rows = max(_SLAB_ROWS, _SLAB_NODES.get(u.device.type, 2**22) // u[:, 0, 0].numel())
     buffers = _Buffers(u)
-    for start in range(0, grid.shape[0], rows):
-        yield _lowest(_padded_slab(u, grid, start, min(start + rows, grid.shape[0]), buffers), buffers)
+    for rows in slabs((grid.shape[0], u[:, 0, 0].numel()), u.device, least=_SLAB_ROWS):
+        yield _lowest(_padded_slab(u, grid, rows.start, rows.stop, buffers), buffers)
 
 
 def _padded_slab(u: Tensor, grid: Grid, start: int, stop: int, buffers: _Buffers) -> Tensor:

@@ -100,6 +100,8 @@ def restriction(fine: int, coarse: int, blur: float, like: Tensor) -> Banded | N
         blur: standard deviation in voxels of the coarse axis.
         like: a tensor with the dtype and device wanted.
     """
+    if coarse == fine:
+        return None
     sigma = blur * (fine - 1) / (coarse - 1)
     radius = math.ceil(_REACH * sigma)
     offset = torch.arange(-radius, radius + 1)
@@ -107,7 +109,7 @@ def restriction(fine: int, coarse: int, blur: float, like: Tensor) -> Banded | N
     rows, columns, values = (part.unsqueeze(1) for part in _linear(fine, coarse))
     columns, values = (columns + offset).clamp(0, fine - 1), values * kernel
     flat = rows.expand_as(columns).flatten(), columns.flatten(), values.flatten()
-    return None if coarse == fine else banded(*flat, (coarse, fine), like)
+    return banded(*flat, (coarse, fine), like)
 
 
 def _linear(given: int, wanted: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,7 +1,7 @@
 """What the pictures of a registration show: slices of the images and of what the map did, on one scale."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from torchdeform.grid import Grid, over_slabs
 from torchdeform.image import Image, luminance
 from torchdeform.registration.result import RegistrationResult
 from torchdeform.report.planes import Plane, planes_of
-from torchdeform.stencil import CURL_PAIRS, determinant, jacobian
+from torchdeform.stencil import CURL_PAIRS, by_slabs, determinant, jacobian
 from torchdeform.transform import Affine
 from torchdeform.warp import sample, voxels
 
@@ -23,7 +23,6 @@ _SMALLEST = 1e-3  # determinants below this, folds among them, are drawn as this
 _LEAST = {"log_det": math.log(2), "inverse_error": 0.5}
 _BINS = 81
 _COLOURED = (3, 4)  # channels of pictures in colour, without alpha and with it
-_SLAB_ROWS = 8
 _KEPT = 0.96  # of an axis: slices nearer to its ends show nothing
 
 
@@ -224,29 +223,18 @@ def rates(u: Tensor, grid: Grid) -> dict[str, Tensor]:
     Notes:
         Slab after slab along the first axis, so that the derivatives never fill the memory.
     """
-    found = {name: u.new_empty(1, 1, *grid.shape) for name in ("determinant", "divergence", "rotation")}
-    for start, stop, low, high in _slabs(grid.shape[0]):
-        part = Grid((high - low, *grid.shape[1:]), grid.spacing)
-        values = _rates_of(jacobian(u.narrow(2, low, high - low), part), grid.dim)
-        for name, value in values.items():
-            found[name][:, :, start:stop] = value.narrow(2, start - low, stop - start)
-    return found
+    names = ("determinant", "divergence", "rotation")
+    found = by_slabs(lambda w, part: _rates_of(jacobian(w, part)), u, grid)
+    return dict(zip(names, found.split(1, dim=1), strict=True))
 
 
-def _slabs(count: int) -> Iterator[tuple[int, int, int, int]]:
-    """Yield rows start to stop, and the rows low to high that their differences need."""
-    for start in range(0, count, _SLAB_ROWS):
-        stop = min(start + _SLAB_ROWS, count)
-        high = min(max(stop + 1, 3), count)
-        yield start, stop, max(min(start - 1, high - 3), 0), high
-
-
-def _rates_of(slope: Tensor, dim: int) -> dict[str, Tensor]:
-    """Return determinant, divergence and rotation where the derivatives ∂_a u_k are ``slope`` ``(1, D, D, *T)``."""
+def _rates_of(slope: Tensor) -> Tensor:
+    """Return determinant, divergence and rotation ``(1, 3, *T)`` where ∂_a u_k are ``slope`` ``(1, D, D, *T)``."""
+    dim = slope.shape[1]
     for k in range(dim):
         slope[:, k, k] += 1
     det = determinant(slope)
     trace = torch.stack([slope[:, k, k] for k in range(dim)]).sum(0).unsqueeze(1) - dim
     turn = torch.stack([slope[:, b, a] - slope[:, a, b] for a, b in CURL_PAIRS[dim]], dim=1)
     rotation = turn if dim == 2 else turn.square().sum(1, keepdim=True).sqrt()
-    return {"determinant": det, "divergence": trace, "rotation": rotation}
+    return torch.cat([det, trace, rotation], dim=1)
