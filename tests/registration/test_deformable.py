@@ -17,7 +17,7 @@ from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.steps import advance, relaxed
 from torchdeform.warp import compose, max_voxels, warp
 
-QUICK = RegistrationSettings(steps=(30, 30, 20), length=6.0, window=7)
+QUICK = RegistrationSettings(steps=(30, 30, 20), step_length=0.5, length=6.0, window=7)
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
@@ -185,6 +185,8 @@ def test_bad_input_is_named(fixed, moving, message):
         ("weight_div", -1.0),
         ("weight_curl", math.inf),
         ("step_length", math.nan),
+        ("momentum", -0.1),
+        ("momentum", 1.0),
         ("tolerance", -0.1),
         ("soft_determinant", -1.0),
         ("min_determinant", 0.0),
@@ -220,6 +222,18 @@ def test_a_displacement_relaxes_as_heat_spreads(shape):
     expected = torch.stack([(1 - 0.1 * (1 - factor)) * u[0], u[1]])
     torch.testing.assert_close(relaxed(u, share, grid), expected)
     assert torch.equal(relaxed(u[1:], share[1:], grid), u[1:])
+
+
+@pytest.mark.parametrize("similarity", ["lncc", "ssd"])
+def test_momentum_gets_nearer_to_a_known_map_in_as_many_steps(similarity):
+    grid = Grid((32, 28, 36))
+    moving, truth = blobs(grid.shape), bend(grid, 3.0)
+    few = RegistrationSettings(steps=(12, 10, 8), length=6.0, window=7, similarity=similarity, tolerance=0.0)
+    errors = [
+        (register(warp(moving, truth, grid), moving, replace(few, momentum=m)).displacement - truth).norm().item()
+        for m in (0.4, 0.0)
+    ]
+    assert errors[0] < 0.9 * errors[1]
 
 
 def test_elasticity_keeps_a_map_nearer_to_an_affine_one():

@@ -21,7 +21,9 @@ from torchdeform.registration.symmetric import common_axes, middle_frame, root
 from torchdeform.transform import Affine
 from torchdeform.warp import compose, max_voxels, voxels, warp
 
-SYMMETRIC = RegistrationSettings(steps=(30, 20, 10), length=6.0, window=7, symmetric=True, align="none")
+SYMMETRIC = RegistrationSettings(
+    steps=(30, 20, 10), step_length=0.5, length=6.0, window=7, symmetric=True, align="none"
+)
 
 
 @pytest.mark.parametrize("shape", [(64, 80), (28, 26, 32)])

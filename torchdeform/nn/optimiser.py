@@ -33,8 +33,8 @@ class DeformableRegistration(nn.Module):
         grid: the grid of images and displacement.
         steps: how many.
         settings: ``similarity`` (a name but ``mind``), ``window``, ``weight_div``, ``weight_curl``, ``length``,
-            ``elasticity``, ``power``, ``step_length`` and ``min_determinant`` are used; those of the preset
-            ``default`` when None.
+            ``elasticity``, ``power``, ``step_length``, ``momentum`` and ``min_determinant`` are used; those of the
+            preset ``default`` when None.
 
     Raises:
         InputError: steps below 1, a similarity that is a mixture or ``mind``.
@@ -42,9 +42,9 @@ class DeformableRegistration(nn.Module):
     Notes:
         Differentiable once in the images and in the start, through all steps: their gradients tell a network what its
         answer became, not what it was. The share of a step that would fold counts as constant. Each step is computed
-        again in the backward, so what is kept is one displacement a step and one step's own. Every step is
-        looked at by the full certificate and shortened where it would fold, so a sound start ends as a sound map. The
-        look at the certificate breaks no graph, checkpoints do: compile the network, not this.
+        again in the backward, so what is kept is one displacement and one direction a step, and one step's own. Every
+        step is looked at by the full certificate and shortened where it would fold, so a sound start ends as a sound
+        map. The look at the certificate breaks no graph, checkpoints do: compile the network, not this.
     """
 
     def __init__(self, grid: Grid, *, steps: int = 20, settings: RegistrationSettings | None = None) -> None:
@@ -75,27 +75,34 @@ class DeformableRegistration(nn.Module):
         u = fixed.new_zeros(fixed.shape[0], self.grid.dim, *self.grid.shape) if start is None else start
         self.grid.check_vector(u, "DeformableRegistration: start")
         metric = self._metric(fixed)
+        carried = torch.zeros_like(u)
         for step in range(self.steps):
             pace = step_length(self.settings, step, self.steps)
-            u = checkpoint(self._step, fixed, moving, u, pace, metric, use_reentrant=False)
+            u, carried = checkpoint(self._step, fixed, moving, u, carried, pace, metric, use_reentrant=False)
         return u
 
     def _metric(self, like: Tensor) -> TransformSolver:
         weights = metric_weights(self.grid, self.settings, 0)
         return TransformSolver(self.grid, weights, "slip", dtype=like.dtype, device=like.device)
 
-    def _step(self, fixed: Tensor, moving: Tensor, u: Tensor, pace: float, metric: TransformSolver) -> Tensor:
-        move = self._move(fixed, moving, u, metric)
-        longest = (move / self.grid.along(self.grid.spacing, move)).square().sum(1).flatten(1).amax(1).sqrt()
-        move = move * column(pace / longest.clamp(min=torch.finfo(move.dtype).tiny), move)
+    def _step(
+        self, fixed: Tensor, moving: Tensor, u: Tensor, carried: Tensor, pace: float, metric: TransformSolver
+    ) -> tuple[Tensor, Tensor]:
+        carried = self._in_voxels(self._velocity(fixed, moving, u, metric)) + self.settings.momentum * carried
+        move = pace * self._in_voxels(carried)
         trial = compose(u, integrate(move, self.grid, steps=1, method="midpoint"), self.grid)
         trial = relaxed(trial, u.new_full((len(u),), self.settings.elasticity), self.grid)
         with torch.no_grad():
             least = smallest_determinant(u, self.grid).clamp(max=self.settings.min_determinant)
             share = open_share(u.detach(), (trial - u).detach(), least, self.grid.spacing, math.inf, math.inf)
-        return u + column(share, u) * (trial - u)
+        return u + column(share, u) * (trial - u), carried
 
-    def _move(self, fixed: Tensor, moving: Tensor, u: Tensor, metric: TransformSolver) -> Tensor:
+    def _in_voxels(self, v: Tensor) -> Tensor:
+        """Return v on the scale on which its longest move is one voxel; `levels.in_voxels` is not differentiable."""
+        longest = (v / self.grid.along(self.grid.spacing, v)).square().sum(1).flatten(1).amax(1).sqrt()
+        return v / column(longest.clamp(min=torch.finfo(v.dtype).tiny), v)
+
+    def _velocity(self, fixed: Tensor, moving: Tensor, u: Tensor, metric: TransformSolver) -> Tensor:
         """Return the velocity that least squares find for the force, its strongest part being 1."""
         warped = warp(moving, u, self.grid)
         force = image_force(self._slope(fixed, warped), warped, self.grid)

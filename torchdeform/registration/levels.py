@@ -27,7 +27,7 @@ from torchdeform.stencil import derivative
 from torchdeform.warp import max_voxels
 
 # Steps over which a level must have gained, see `RegistrationSettings.tolerance`.
-_PATIENCE = 10
+_PATIENCE = 5
 
 # The step falls to this share of itself over a level.
 _LAST_STEP = 0.1
@@ -156,7 +156,7 @@ def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> 
     """Climb one level; every pair ends at the best maps it met."""
     start, shortened, settings = perf_counter(), 0, level.settings
     steps = steps_on(level.comparison.grid, settings.steps[level.index - levels], settings)
-    best, values, tops = u, [], []
+    carried, best, values, tops = torch.zeros_like(u), u, [], []
     top = u.new_full((len(u) // level.sides,), -torch.inf)
     active, lowest = torch.ones_like(top, dtype=torch.bool), lowest_determinant(u, level.grid)
     for step in range(steps + 1):
@@ -173,7 +173,8 @@ def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> 
         if step == steps or not bool(active.any()):
             break
         divergence = (settings.soft_determinant / lowest - 1).clamp_(min=0)
-        v = _velocity(level, warped, gradient, divergence, pull)
+        carried = _velocity(level, warped, gradient, divergence, pull) + settings.momentum * carried
+        v = in_voxels(carried, level.grid)
         del warped, gradient  # before the next are made
         pace = step_length(settings, step, steps) / level.sides
         move = v * column((_pace(pace, v, pull, level) * active).repeat(level.sides), v)
@@ -211,6 +212,11 @@ def _velocity(level: _Level, warped: Tensor, gradient: Tensor, divergence: Tenso
         v = v + level.metric.solve(load, power=level.settings.power + 1)
     if level.sides == 2:
         v = v - v.roll(len(v) // 2, 0)
+    return in_voxels(v, grid)
+
+
+def in_voxels(v: Tensor, grid: Grid) -> Tensor:
+    """Return the velocity ``(B, D, *S)`` on the scale on which its longest move is one voxel; 0 stays 0."""
     return v / column(max_voxels(v, grid).clamp(min=torch.finfo(v.dtype).tiny), v)
 
 

@@ -56,7 +56,9 @@ class RegistrationSettings:
         steps: steps at most on each pyramid level, coarse to fine; its length is the number of levels (a level that
             would leave fewer than 16 nodes on every axis is dropped).
         step_length: longest move in one step, in voxels of the map; falls linearly to a tenth of this over a level.
-        tolerance: a level stops when 10 steps raised the best similarity by less than this share of its rise so far.
+        momentum: at least 0 and below 1; the direction of a step is Σ_k momentumᵏ v_k of the velocities so far, the
+            newest being v_0. What they agree on is reached sooner, what they take back from each other cancels.
+        tolerance: a level stops when 5 steps raised the best similarity by less than this share of its rise so far.
         map_spacing: spacing of the grid that carries the map, in voxels of the level's images, on levels of more than
             2^17 voxels, which take map_spacing² times fewer steps; smaller ones carry it at every voxel.
         soft_determinant: where a one-sided determinant J is smaller than this, a divergence proportional to
@@ -77,10 +79,11 @@ class RegistrationSettings:
     weight_div: float = 0.5
     weight_curl: float = 1.0
     length: float | tuple[float, ...] = (8.0, 4.0, 2.5)
-    elasticity: float = 0.08
+    elasticity: float = 0.2
     power: int = 1
-    steps: tuple[int, ...] = (60, 60, 60)
-    step_length: float = 0.5
+    steps: tuple[int, ...] = (40, 30, 24)
+    step_length: float = 1.0
+    momentum: float = 0.4
     tolerance: float = 0.03
     map_spacing: float = 2.0
     soft_determinant: float = 0.15
@@ -109,6 +112,8 @@ class RegistrationSettings:
                 raise InputError(f"{name} must be positive and finite, got {getattr(self, name)}")
         if not 0 <= self.elasticity <= 1:
             raise InputError(f"elasticity must lie between 0 and 1, got {self.elasticity}")
+        if not 0 <= self.momentum < 1:
+            raise InputError(f"momentum must be at least 0 and below 1, got {self.momentum}")
         if not 1 <= self.map_spacing <= 8:
             raise InputError(f"map_spacing must lie between 1 and 8 voxels, got {self.map_spacing}")
         for name in ("soft_determinant", "tolerance", "points_weight"):
