@@ -33,6 +33,9 @@ _WINDOW = {2: 7, 3: 5}
 # Voxels around a mask that belong to the picture.
 _MARGIN = 4
 
+# Voxels within which the summit of a level is found, and that of the finest.
+_NEAR, _NEAREST = 0.02, 0.01
+
 # Levels on which several candidates are climbed.
 _CONTEST = 2
 
@@ -208,7 +211,8 @@ def _descend(levels: list[Level], candidates: list[Candidate], kind: str, settin
             candidates = [*candidates, still]
         if index >= _CONTEST:
             candidates = candidates[:1]  # the most similar on the level before
-        candidates = [c for c in climbed(level, candidates, moves, settings.steps) if c.value > -math.inf]
+        near = _NEAREST if level is levels[-1] else _NEAR
+        candidates = [c for c in climbed(level, candidates, moves, settings.steps, near) if c.value > -math.inf]
     if not candidates:
         raise ComputationError(
             "align: no start brings enough of the images together; check that they show the same, or lower min_overlap"

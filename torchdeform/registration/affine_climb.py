@@ -8,9 +8,8 @@ from torch import Tensor
 
 from torchdeform.registration.affine_group import exponential
 
-# Longest step, in voxels of the level, and the one below which an item stands still.
+# Longest step, in voxels of the level.
 _LONGEST = 2.0
-_SHORTEST = 0.005
 
 
 class Hill(Protocol):
@@ -41,7 +40,7 @@ class _State:
 
 
 @torch.no_grad()
-def climb(hill: Hill, maps: Tensor, moves: Tensor, *, steps: int) -> tuple[Tensor, Tensor]:
+def climb(hill: Hill, maps: Tensor, moves: Tensor, *, steps: int, shortest: float = 0.005) -> tuple[Tensor, Tensor]:
     """Return the maps after at most ``steps`` evaluations uphill, H ← H exp(Σ p_k L_k), and their values.
 
     Args:
@@ -49,11 +48,11 @@ def climb(hill: Hill, maps: Tensor, moves: Tensor, *, steps: int) -> tuple[Tenso
         maps: starts ``(B, D + 1, D + 1)``, float64.
         moves: the moves allowed ``(P, D, D + 1)``, see `generators`.
         steps: evaluations at most.
+        shortest: step, in voxels of the level, below which an item stands still.
 
     Notes:
         Quasi-Newton: −S is modelled by κ·metric at first, with κ from the first step, then corrected by BFGS. A step
-        that does not raise S is cut to a third. Items do not influence each other. An item stops when its step is
-        shorter than 0.005 voxels.
+        that does not raise S is cut to a third. Items do not influence each other.
     """
     flat = moves.flatten(1)
     value, slope = hill.evaluate(maps)
@@ -62,7 +61,7 @@ def climb(hill: Hill, maps: Tensor, moves: Tensor, *, steps: int) -> tuple[Tenso
     fraction = torch.ones_like(value)
     for _ in range(steps):
         step = _direction(hill, state, moves) * fraction.unsqueeze(1)
-        active = hill.reach(torch.einsum("bp,pij->bij", step, moves)) > _SHORTEST
+        active = hill.reach(torch.einsum("bp,pij->bij", step, moves)) > shortest
         if not bool(active.any()):
             break
         trial = state.maps @ exponential(step, moves)

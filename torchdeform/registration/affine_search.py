@@ -20,6 +20,9 @@ _KEPT = 3
 _SAME_START = 0.3
 _SAME_END = 0.05
 
+# Voxels of the coarsest level within which a summit is found here; it is climbed again.
+_NEAR = 0.05
+
 # A map that turns further than this many degrees has to be better than the others by this share.
 _TURNED = 45.0
 _TURNED_GAIN = 1.1
@@ -70,9 +73,11 @@ class Found:
         return self.mirror > _MIRROR_GAIN
 
 
-def climbed(level: Level, candidates: Sequence[Candidate], moves: Tensor, steps: int) -> list[Candidate]:
+def climbed(
+    level: Level, candidates: Sequence[Candidate], moves: Tensor, steps: int, shortest: float
+) -> list[Candidate]:
     """Return the candidates after climbing a level, the most similar first."""
-    maps, values = climb(level, torch.stack([c.map for c in candidates]), moves, steps=steps)
+    maps, values = climb(level, torch.stack([c.map for c in candidates]), moves, steps=steps, shortest=shortest)
     moved = [Candidate(c.name, m, float(v)) for c, m, v in zip(candidates, maps, values, strict=True)]
     return sorted(moved, key=lambda c: -c.value)
 
@@ -111,8 +116,8 @@ def _try(level: Level, starts: list[Start], kind: str, steps: int, most: int) ->
         return [], 0.0
     chance = float(value[finite].median())
     merit = (value - chance) * shared.clamp(max=1.0)
-    chosen = _promising(starts, maps, merit, most)
-    ends = climbed(level, [Candidate(starts[i].name, maps[i], 0.0) for i in chosen], generators(kind, level.dim), steps)
+    chosen = [Candidate(starts[i].name, maps[i], 0.0) for i in _promising(starts, maps, merit, most)]
+    ends = climbed(level, chosen, generators(kind, level.dim), steps, _NEAR)
     value, shared = level.values(torch.stack([c.map for c in ends]))
     merit = chance + (value - chance) * shared.clamp(max=1.0)
     return [replace(c, value=float(m)) for c, m in zip(ends, merit, strict=True)], chance
