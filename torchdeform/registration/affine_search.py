@@ -10,6 +10,7 @@ from torchdeform.registration.affine_climb import climb
 from torchdeform.registration.affine_group import angle, generators
 from torchdeform.registration.affine_level import Level
 from torchdeform.registration.affine_starts import Start, body, make_starts
+from torchdeform.registration.threads import threads_worth
 
 # Starts that are climbed, mirrored ones among them, and those that go on to the next level.
 _CLIMBED = 10
@@ -77,7 +78,9 @@ def climbed(
     level: Level, candidates: Sequence[Candidate], moves: Tensor, steps: int, shortest: float
 ) -> list[Candidate]:
     """Return the candidates after climbing a level, the most similar first."""
-    maps, values = climb(level, torch.stack([c.map for c in candidates]), moves, steps=steps, shortest=shortest)
+    starts = torch.stack([c.map for c in candidates])
+    with threads_worth(len(candidates) * (level.dim + 2), level.fixed.image.grid):  # image, its slopes, its weight
+        maps, values = climb(level, starts, moves, steps=steps, shortest=shortest)
     moved = [Candidate(c.name, m, float(v)) for c, m, v in zip(candidates, maps, values, strict=True)]
     return sorted(moved, key=lambda c: -c.value)
 

@@ -15,7 +15,7 @@ from torchdeform.registration.comparison import compare_from_fixed
 from torchdeform.registration.discrete import discrete_start
 from torchdeform.registration.evaluation import evaluate_images, evaluate_tensors
 from torchdeform.registration.guidance import Guidance
-from torchdeform.registration.levels import climb_levels, threads_worth
+from torchdeform.registration.levels import climb_levels
 from torchdeform.registration.placing import Subject, moved, place, subjects
 from torchdeform.registration.pyramid import MIN_NODES
 from torchdeform.registration.result import Callback, LevelRecord, RegistrationResult
@@ -28,6 +28,7 @@ from torchdeform.registration.symmetric import (
     climb_from_middle,
     common_axes,
 )
+from torchdeform.registration.threads import threads_worth
 from torchdeform.transform import Affine
 from torchdeform.warp import invert, warp
 

@@ -1,8 +1,6 @@
 """Climbing the levels: forces ask for divergence and curl, least squares give the velocity, its flow moves the maps."""
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -22,6 +20,7 @@ from torchdeform.registration.result import Callback, LevelRecord, Progress
 from torchdeform.registration.scene import Scene
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.steps import advance, keep, lowest_determinant, mended
+from torchdeform.registration.threads import threads_worth
 from torchdeform.registration.transfer import Transfer
 from torchdeform.stencil import derivative
 from torchdeform.warp import max_voxels
@@ -31,10 +30,6 @@ _PATIENCE = 5
 
 # The step falls to this share of itself over a level.
 _LAST_STEP = 0.1
-
-# Fewer nodes than this are not worth more than one thread: with two threads beside another busy program, a pair of
-# 291×216 took twice as long as with one.
-_NODES_PER_THREAD = 2**16
 
 # Levels whose images have more nodes than this carry the map on the coarser grid of `RegistrationSettings.map_spacing`.
 # Mouse brains (10^6 nodes) gain 0.003 Dice and half of the time by it; slices and hippocampi (7·10^4) would lose 0.01.
@@ -103,17 +98,6 @@ def climb_levels(
             u, record = _climb(level, mended(prolong(u, level.grid), level.grid), len(grids), callback)
         records.append(record)
     return mended(prolong(u, scene.grid), scene.grid), tuple(records)
-
-
-@contextmanager
-def threads_worth(items: int, grid: Grid) -> Iterator[None]:
-    """Use no more of torch's threads than the fields are worth: on a shared machine small ones wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(max(1, min(before, items * math.prod(grid.shape) // _NODES_PER_THREAD)))
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def metric_weights(grid: Grid, settings: RegistrationSettings, below: int) -> Weights:
