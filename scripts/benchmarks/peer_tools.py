@@ -136,7 +136,8 @@ def _torchdeform(preset: str) -> Tool:
         td.write_transform(transform, job.folder / "transform.h5")
         return lambda: _itk_transform(job, job.folder / "transform.h5")
 
-    needs = ("torchdeform", "torchdeform.pair", "torchdeform.registration.deformable", "SimpleITK", "pydantic", "yaml")
+    ours = ("torchdeform", "torchdeform.pair", "torchdeform.registration.deformable")
+    needs = (*ours, "SimpleITK", "pydantic", "pydantic.dataclasses", "pydantic.type_adapter", "yaml")
     return Tool("torchdeform", needs, f"preset {preset}: alignment and deformation", register)
 
 

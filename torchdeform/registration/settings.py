@@ -78,12 +78,12 @@ class RegistrationSettings:
     window: int = 9
     weight_div: float = 0.5
     weight_curl: float = 1.0
-    length: float | tuple[float, ...] = (8.0, 4.0, 2.5)
+    length: float | tuple[float, ...] = (8.0, 5.0, 2.5)
     elasticity: float = 0.2
     power: int = 1
     steps: tuple[int, ...] = (40, 30, 24)
     step_length: float = 1.0
-    momentum: float = 0.4
+    momentum: float = 0.5
     tolerance: float = 0.03
     map_spacing: float = 2.0
     soft_determinant: float = 0.15
