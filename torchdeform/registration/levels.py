@@ -7,6 +7,7 @@ from time import perf_counter
 import torch
 from torch import Tensor
 
+from torchdeform.diagnostics import one_sided_determinant
 from torchdeform.fem.form import Form, Row, Term
 from torchdeform.fem.operator import assemble_load
 from torchdeform.fem.spectral import TransformSolver
@@ -19,7 +20,7 @@ from torchdeform.registration.pyramid import prolong, pyramid_grids, thinned
 from torchdeform.registration.result import Callback, LevelRecord, Progress
 from torchdeform.registration.scene import Scene
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.registration.steps import advance, keep, lowest_determinant, mended
+from torchdeform.registration.steps import advance, keep, mended
 from torchdeform.registration.threads import threads_worth
 from torchdeform.registration.transfer import Transfer
 from torchdeform.stencil import derivative
@@ -142,7 +143,7 @@ def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> 
     steps = steps_on(level.comparison.grid, settings.steps[level.index - levels], settings)
     carried, best, values, tops = torch.zeros_like(u), u, [], []
     top = u.new_full((len(u) // level.sides,), -torch.inf)
-    active, lowest = torch.ones_like(top, dtype=torch.bool), lowest_determinant(u, level.grid)
+    active, lowest = torch.ones_like(top, dtype=torch.bool), one_sided_determinant(u, level.grid)
     for step in range(steps + 1):
         warped, value, gradient = level.comparison.look(level.transfer.up(u) if level.transfer else u)
         pull = level.landmarks.look(u) if level.landmarks else None

@@ -22,13 +22,14 @@ _SHORTEST = 2.0**-6
 def advance(
     state: tuple[Tensor, Tensor], move: Tensor, share: Tensor, grid: Grid, limit: float, sides: int = 1
 ) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Return u ∘ flow(move), relaxed, its `lowest_determinant`, which pairs moved, and how often a step was halved.
+    """Return u ∘ flow(move), relaxed, its `one_sided_determinant`, which pairs moved, and how often a step was halved.
 
     No determinant falls below ``limit``, or below the smallest one there was if that was less. Along the halvings the
-    trial tends to u, so a bold step ends as a short one.
+    trial tends to u, so a bold step ends as a short one. The extrapolated determinants on the faces of the box are left
+    to `mended`, after the last step: they take as long as all the others and hardly ever fold alone.
 
     Args:
-        state: u ``(sides·B, D, *S)`` in units of spacing, and its `lowest_determinant`.
+        state: u ``(sides·B, D, *S)`` in units of spacing, and its `one_sided_determinant`.
         move: velocity, the same shape.
         share: of the way to its `neighbour_mean` that the new u is taken, for each map ``(sides·B,)``, see `relaxed`.
         grid: the grid of both.
@@ -40,7 +41,7 @@ def advance(
     fraction, halved = torch.ones_like(floor), 0
     while True:
         trial = relaxed(compose(u, _flow(move * column(fraction, u), grid), grid), share * fraction, grid)
-        trial_lowest = lowest_determinant(trial, grid)
+        trial_lowest = one_sided_determinant(trial, grid)
         low = _any_side(~(trial_lowest.flatten(1).amin(1) >= floor), sides)
         count = int(low.sum()) // sides
         if count == 0:
