@@ -16,7 +16,7 @@ from torchdeform.grid import Grid
 from torchdeform.nn.losses import SIMILARITIES
 from torchdeform.nn.operators import open_share
 from torchdeform.nn.precision import full_precision
-from torchdeform.registration.levels import image_force, metric_weights, step_length, strongest_of
+from torchdeform.registration.levels import image_force, in_voxels, metric_weights, step_length, strongest_of
 from torchdeform.registration.metrics.base import column
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.steps import relaxed
@@ -88,19 +88,15 @@ class DeformableRegistration(nn.Module):
     def _step(
         self, fixed: Tensor, moving: Tensor, u: Tensor, carried: Tensor, pace: float, metric: TransformSolver
     ) -> tuple[Tensor, Tensor]:
-        carried = self._in_voxels(self._velocity(fixed, moving, u, metric)) + self.settings.momentum * carried
-        move = pace * self._in_voxels(carried)
+        v = in_voxels(self._velocity(fixed, moving, u, metric), self.grid)
+        carried = v + self.settings.momentum * carried
+        move = pace * in_voxels(carried, self.grid)
         trial = compose(u, integrate(move, self.grid, steps=1, method="midpoint"), self.grid)
         trial = relaxed(trial, u.new_full((len(u),), self.settings.elasticity), self.grid)
         with torch.no_grad():
             least = smallest_determinant(u, self.grid).clamp(max=self.settings.min_determinant)
             share = open_share(u.detach(), (trial - u).detach(), least, self.grid.spacing, math.inf, math.inf)
         return u + column(share, u) * (trial - u), carried
-
-    def _in_voxels(self, v: Tensor) -> Tensor:
-        """Return v on the scale on which its longest move is one voxel; `levels.in_voxels` is not differentiable."""
-        longest = (v / self.grid.along(self.grid.spacing, v)).square().sum(1).flatten(1).amax(1).sqrt()
-        return v / column(longest.clamp(min=torch.finfo(v.dtype).tiny), v)
 
     def _velocity(self, fixed: Tensor, moving: Tensor, u: Tensor, metric: TransformSolver) -> Tensor:
         """Return the velocity that least squares find for the force, its strongest part being 1."""

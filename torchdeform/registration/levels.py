@@ -24,7 +24,6 @@ from torchdeform.registration.steps import advance, keep, mended
 from torchdeform.registration.threads import threads_worth
 from torchdeform.registration.transfer import Transfer
 from torchdeform.stencil import derivative
-from torchdeform.warp import max_voxels
 
 # Steps over which a level must have gained, see `RegistrationSettings.tolerance`.
 _PATIENCE = 5
@@ -202,7 +201,8 @@ def _velocity(level: _Level, warped: Tensor, gradient: Tensor, divergence: Tenso
 
 def in_voxels(v: Tensor, grid: Grid) -> Tensor:
     """Return the velocity ``(B, D, *S)`` on the scale on which its longest move is one voxel; 0 stays 0."""
-    return v / column(max_voxels(v, grid).clamp(min=torch.finfo(v.dtype).tiny), v)
+    longest = strongest_of(v / grid.along(grid.spacing, v))
+    return v / column(longest.clamp(min=torch.finfo(v.dtype).tiny), v)
 
 
 def step_length(settings: RegistrationSettings, step: int, steps: int) -> float:
