@@ -1,5 +1,7 @@
 """Banded matrices against torch's own interpolation, padding and convolution, and against the dense matrix."""
 
+from unittest import mock
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -7,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd import gradcheck
 
+import torchdeform.registration.banded as module
 from torchdeform.registration.banded import banded, gathering, interpolation, multiply, restriction
 
 LIKE = torch.zeros(0, dtype=torch.float64)
@@ -18,8 +21,9 @@ def applied(matrix, line):
 
 
 @settings(max_examples=40, deadline=None)
+@pytest.mark.parametrize("small", [0, 2**13])
 @given(st.integers(1, 90), st.integers(1, 90), st.integers(0, 200), st.integers(0, 2), st.integers(0, 99))
-def test_it_is_the_dense_matrix(count, size, entries, axis, seed):
+def test_it_is_the_dense_matrix(small, count, size, entries, axis, seed):
     """Rows without entries and places with several among them; along every axis, also where a gradient is wanted."""
     generator = torch.manual_seed(seed)
     rows = torch.randint(0, count, (entries,), generator=generator)
@@ -28,7 +32,8 @@ def test_it_is_the_dense_matrix(count, size, entries, axis, seed):
     dense = torch.zeros(count, size, dtype=torch.float64).index_put_((rows, columns), values, accumulate=True)
     field = torch.rand(2, 3, *(size if a == axis else 4 for a in range(3)), dtype=torch.float64)
     expected = torch.tensordot(dense, field, dims=([1], [axis + 2])).movedim(0, axis + 2)
-    matrix = banded(rows, columns, values, (count, size), LIKE)
+    with mock.patch.object(module, "_SMALL", small):  # in blocks, and as one
+        matrix = banded(rows, columns, values, (count, size), LIKE)
     torch.testing.assert_close(matrix.along(field, axis + 2), expected)
     torch.testing.assert_close(matrix.along(field.requires_grad_(), axis + 2).detach(), expected)
 
