@@ -134,6 +134,11 @@ class Level:
         """Number of axes D."""
         return self.fixed.image.grid.dim
 
+    @property
+    def fields(self) -> int:
+        """Number of fields that are sampled for a map: the channels, their slopes, and the weight."""
+        return self._channels.shape[1]
+
     def evaluate(self, maps: Tensor) -> tuple[Tensor, Tensor]:
         """Return S ``(B,)`` and ∂S/∂ξ ``(B, D, D + 1)`` for maps followed by q + ξ [q; 1], see `Hill`.
 
@@ -147,7 +152,7 @@ class Level:
 
     def values(self, maps: Tensor) -> tuple[Tensor, Tensor]:
         """Return S and the overlap, each ``(B,)``; any number of maps."""
-        size = max(1, _CHUNK // (self._channels.shape[1] * self.points.shape[1]))
+        size = max(1, _CHUNK // (self.fields * self.points.shape[1]))
         parts = []
         for some in maps.split(size):
             _, warped, _, weight = self._warped(some)

@@ -79,7 +79,7 @@ def climbed(
 ) -> list[Candidate]:
     """Return the candidates after climbing a level, the most similar first."""
     starts = torch.stack([c.map for c in candidates])
-    with threads_worth(len(candidates) * (level.dim + 2), level.fixed.image.grid):  # image, its slopes, its weight
+    with threads_worth(len(candidates) * level.fields, level.fixed.image.grid):
         maps, values = climb(level, starts, moves, steps=steps, shortest=shortest)
     moved = [Candidate(c.name, m, float(v)) for c, m, v in zip(candidates, maps, values, strict=True)]
     return sorted(moved, key=lambda c: -c.value)
