@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 import torchdeform as td
-from torchdeform.image import luminance
+from torchdeform.core.image import luminance
 from torchdeform.nn import (
     CurlLoss,
     DivergenceLoss,

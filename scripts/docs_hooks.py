@@ -39,7 +39,7 @@ def on_page_markdown(markdown: str, /, *, page: Page, config: MkDocsConfig, file
 
 def help_texts() -> str:
     """Return what ``torchdeform VERB --help`` prints, a section a verb."""
-    from torchdeform.cli import HELP
+    from torchdeform.cli.main import HELP
 
     sections = (f"## {name}\n\n{HELP[name].summary}\n\n```text\n{_help(name)}\n```" for name in HELP)
     return "\n\n".join(sections)
@@ -47,7 +47,7 @@ def help_texts() -> str:
 
 def _help(verb: str) -> str:
     """Return a verb's help as narrow as a page, without colours."""
-    from torchdeform.cli import torchdeform
+    from torchdeform.cli.main import torchdeform
 
     settings: dict[str, Any] = {"COLUMNS": "84", "TERMINAL_WIDTH": "84", "NO_COLOR": "1"}
     before = {name: os.environ.get(name) for name in settings}

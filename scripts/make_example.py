@@ -52,7 +52,7 @@ def make_picture() -> None:
     """Register the pair and write ``examples/overview.jpg``, the picture of the README."""
     from PIL import Image as Picture
 
-    from torchdeform.pair import PairFiles, register_files
+    from torchdeform.pipeline.register import PairFiles, register_files
 
     with tempfile.TemporaryDirectory() as folder:
         fixed, moving = (ROOT / "examples" / name for name in ("fixed.png", "moving.png"))

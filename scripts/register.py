@@ -5,6 +5,6 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from torchdeform.cli import main
+from torchdeform.cli.main import main
 
 sys.exit(main())

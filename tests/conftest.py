@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchdeform.diagnostics import diagnose
-from torchdeform.grid import Grid
-from torchdeform.image import Image, resample
-from torchdeform.registration.guidance import Guidance
+from torchdeform.core.diagnostics import diagnose
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image, resample
+from torchdeform.core.warp import invert
+from torchdeform.registration.problem import Guidance
 from torchdeform.registration.result import Callback, LevelRecord, Progress, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.warp import invert
 
 if os.environ.get("PYTEST_XDIST_WORKER"):
     torch.set_num_threads(1)

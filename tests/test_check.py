@@ -6,14 +6,21 @@ import pytest
 import torch
 import typer
 
-from torchdeform.check import ERROR, NOTE, WARNING, Report, is_oblique, orientation, preflight
-from torchdeform.cli import explain
-from torchdeform.commands.check import check
-from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image
+from torchdeform.cli.check import check
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
+from torchdeform.errors import InputError, explain
 from torchdeform.io import read_image, write_image
-from torchdeform.registration.likeness import likeness_turned_over
+from torchdeform.pipeline.preflight import (
+    ERROR,
+    NOTE,
+    WARNING,
+    Report,
+    is_oblique,
+    likeness_turned_over,
+    orientation,
+    preflight,
+)
 from torchdeform.registration.settings import RegistrationSettings
 
 SHAPES = {2: (40, 52), 3: (22, 26, 30)}
@@ -186,11 +193,11 @@ def test_masks(dim):
 def test_memory_that_will_not_do(monkeypatch):
     fixed = lopsided(3)
     for room, severity in ((2 * 10**8, ERROR), (4.5 * 10**8, WARNING)):
-        monkeypatch.setattr("torchdeform.check.available", lambda device, room=room: int(room))
+        monkeypatch.setattr("torchdeform.pipeline.preflight.available", lambda device, room=room: int(room))
         report = preflight(fixed, fixed)
         assert "of memory and" in texts(report, severity)
         assert "--memory" in texts(report, severity)
-    monkeypatch.setattr("torchdeform.check.available", lambda device: None)
+    monkeypatch.setattr("torchdeform.pipeline.preflight.available", lambda device: None)
     assert preflight(fixed, fixed).findings == ()
 
 

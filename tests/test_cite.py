@@ -6,10 +6,11 @@ from dataclasses import asdict
 
 import pytest
 
-from torchdeform.citations import bibliography, bibtex, citations
-from torchdeform.cli import torchdeform
-from torchdeform.config import load_settings
-from torchdeform.registration.settings import SIMILARITIES, RegistrationSettings
+from torchdeform.cli.main import torchdeform
+from torchdeform.metrics.similarity import SIMILARITIES
+from torchdeform.pipeline.citations import bibliography, bibtex, citations
+from torchdeform.pipeline.config import load_settings
+from torchdeform.registration.settings import RegistrationSettings
 
 ALWAYS = {"torchdeform", "liu2007reconstruction", "liu2024finite"}
 NEEDED = {

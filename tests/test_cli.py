@@ -13,10 +13,10 @@ import SimpleITK as sitk
 import torch
 
 from torchdeform import __version__
-from torchdeform.cli import main, torchdeform
+from torchdeform.cli.main import main, torchdeform
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image, resample
 from torchdeform.errors import ComputationError
-from torchdeform.grid import Grid
-from torchdeform.image import Image, resample
 from torchdeform.io import read_displacement, read_image, write_image
 
 RESULTS = ["displacement.nii.gz", "inverse.h5", "overview.png", "report.html", "result.json", "transform.h5"]
@@ -114,7 +114,7 @@ def test_a_failure_keeps_the_earlier_results(folder, engine, capsys, monkeypatch
     def broken(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("torchdeform.pair.write_overview", broken)
+    monkeypatch.setattr("torchdeform.pipeline.register.write_overview", broken)
     assert "No space left on device" in _fails(capsys, 1, "fixed.png", "moving.png", "--out", "out")
     assert {p.name: p.read_bytes() for p in (folder / "out").iterdir()} == before
 

@@ -4,8 +4,8 @@ from dataclasses import asdict
 
 import pytest
 
-from torchdeform.config import configs_folder, load_settings, parse_override, preset_names, read_yaml
 from torchdeform.errors import InputError
+from torchdeform.pipeline.config import configs_folder, load_settings, parse_override, preset_names, read_yaml
 from torchdeform.registration.settings import RegistrationSettings
 
 

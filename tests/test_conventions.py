@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import torchdeform as td
-from torchdeform.image import Image
-from torchdeform.warp import sample
+from torchdeform.core.image import Image
+from torchdeform.core.warp import sample
 
 
 def ramp(grid: td.Grid, axis: int) -> torch.Tensor:

@@ -8,8 +8,8 @@ import SimpleITK as sitk
 import torch
 
 import torchdeform as td
-from torchdeform.cli import torchdeform
-from torchdeform.image import Image, resample
+from torchdeform.cli.main import torchdeform
+from torchdeform.core.image import Image, resample
 from torchdeform.io import read_displacement, read_image, write_displacement, write_image
 
 

@@ -9,18 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchdeform import grid as grids
-from torchdeform.diagnostics import (
+from torchdeform.core import grid as grids
+from torchdeform.core.derivatives import jacobian_determinant
+from torchdeform.core.diagnostics import (
     diagnose,
     inverse_error,
     is_diffeomorphic,
     one_sided_determinant,
     smallest_determinant,
 )
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import invert
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.stencil import jacobian_determinant
-from torchdeform.warp import invert
 
 UNTIMED = settings(deadline=None, max_examples=30)
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from torchdeform import flow
-from torchdeform.diagnostics import inverse_error
+from torchdeform.core import flow
+from torchdeform.core.diagnostics import inverse_error
+from torchdeform.core.flow import OdeSolver, integrate, integrate_points
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import compose, max_voxels, sample, warp
 from torchdeform.errors import ComputationError, InputError
-from torchdeform.flow import OdeSolver, integrate, integrate_points
-from torchdeform.grid import Grid
-from torchdeform.warp import compose, max_voxels, sample, warp
 
 UNTIMED = settings(deadline=None, max_examples=15)
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

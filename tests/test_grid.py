@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchdeform import grid as module
+from torchdeform.core import grid as module
+from torchdeform.core.grid import Grid, over_slabs, slabs
 from torchdeform.errors import ComputationError, InputError, TorchdeformError, nearest_name, require_choice
-from torchdeform.grid import Grid, over_slabs, slabs
 
 SHAPES = st.integers(2, 3).flatmap(lambda dim: st.tuples(*[st.integers(2, 9)] * dim))
 SPACINGS = st.floats(0.01, 100)

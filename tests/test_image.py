@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image, luminance, overlap, require_registrable, resample
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image, luminance, overlap, require_registrable, resample
 
 
 @pytest.mark.parametrize("dim", [2, 3])

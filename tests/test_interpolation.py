@@ -12,10 +12,10 @@ from scipy.ndimage import convolve1d, map_coordinates
 from torch import Tensor
 from torch.autograd import gradcheck
 
-import torchdeform.interpolation as module
+import torchdeform.core.interpolation as module
+from torchdeform.core.grid import Grid
+from torchdeform.core.interpolation import MODES, interpolator
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.interpolation import MODES, interpolator
 
 SPACING = (0.5, 2.0, 1.2)
 GRIDS = {dim: Grid((7, 6, 8)[:dim], SPACING[:dim]) for dim in (2, 3)}

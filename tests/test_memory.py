@@ -9,12 +9,12 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-import torchdeform.memory as memory
+import torchdeform.pipeline.memory as memory
+from torchdeform.core.grid import Grid
+from torchdeform.core.resampling import MIN_NODES
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.memory import available, estimate, fitting_grid, parse_size, peak, readable
-from torchdeform.registration.pyramid import MIN_NODES
-from torchdeform.registration.settings import SIMILARITIES
+from torchdeform.metrics.similarity import SIMILARITIES
+from torchdeform.pipeline.memory import available, estimate, fitting_grid, parse_size, peak, readable
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts" / "benchmarks"))
 from memory import QUICK, estimated, measure  # type: ignore[attr-defined]

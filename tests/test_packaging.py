@@ -38,7 +38,8 @@ def test_presets_are_found_in_an_installed_package(wheel, tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path)
     code = (
-        "from torchdeform.config import configs_folder, load_settings; load_settings('fast'); print(configs_folder())"
+        "from torchdeform.pipeline.config import configs_folder, load_settings\n"
+        "load_settings('fast'); print(configs_folder())"
     )
     done = subprocess.run(
         [sys.executable, "-c", code],

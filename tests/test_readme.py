@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from torchdeform.config import load_settings
+from torchdeform.pipeline.config import load_settings
 
 
 def _blocks(root: Path, language: str) -> list[str]:
@@ -36,12 +36,12 @@ def test_yaml_snippets_load(root, tmp_path):
 
 def test_commands_are_understood(root, monkeypatch):
     """Every ``register`` line of the README parses: it fails on the missing files at most."""
-    from torchdeform.cli import main
+    from torchdeform.cli.main import main
 
     lines = [line for block in _blocks(root, "sh") for line in block.splitlines() if line.startswith("register ")]
     assert len(lines) >= 3
     seen = []
-    monkeypatch.setattr("torchdeform.commands.register.load_settings", lambda *arguments: seen.append(arguments))
+    monkeypatch.setattr("torchdeform.cli.register.load_settings", lambda *arguments: seen.append(arguments))
     for line in lines:
         assert main(shlex.split(line, comments=True)[1:]) in (1, 2)
     assert len(seen) == len(lines)

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchdeform.image import Image, luminance
+from torchdeform.core.image import Image, luminance
+from torchdeform.core.transform import Affine
 from torchdeform.io import read_image
 from torchdeform.io.points import matched, read_points
-from torchdeform.registration.affine import Alignment, affine_warp, align
-from torchdeform.transform import Affine
+from torchdeform.registration.affine.align import Alignment, affine_warp, align
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts" / "benchmarks"))
 from pairs import SETS, Pair

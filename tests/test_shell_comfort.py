@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from torchdeform import __version__
-from torchdeform.cli import HELP, VERBS, main, torchdeform
-from torchdeform.config import preset_names
+from torchdeform.cli.main import HELP, VERBS, main, torchdeform
+from torchdeform.core.transform import Transform
 from torchdeform.io import write_displacement, write_image
 from torchdeform.io.transforms import write_transform
-from torchdeform.transform import Transform
+from torchdeform.pipeline.config import preset_names
 
 LINES, COLUMNS = 40, 100
 
@@ -135,7 +135,7 @@ def test_an_error_is_no_record(folder, capsys):
 def fresh(code: str, **variables: str) -> str:
     """Return what a fresh interpreter prints, in a pipe."""
     inherited = {name: value for name, value in os.environ.items() if name not in ("FORCE_COLOR", "PY_COLORS")}
-    command = [sys.executable, "-c", f"import sys; from torchdeform.cli import torchdeform; {code}"]
+    command = [sys.executable, "-c", f"import sys; from torchdeform.cli.main import torchdeform; {code}"]
     done = subprocess.run(command, env={**inherited, **variables}, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout + done.stderr

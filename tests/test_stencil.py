@@ -10,10 +10,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
-from torchdeform import grid as module
-from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.stencil import (
+from torchdeform.core import grid as module
+from torchdeform.core.derivatives import (
     KERNELS,
     by_slabs,
     cofactors,
@@ -25,6 +23,8 @@ from torchdeform.stencil import (
     jacobian_determinant,
     map_jacobian,
 )
+from torchdeform.core.grid import Grid
+from torchdeform.errors import InputError
 
 ORDERS = sorted(KERNELS)
 UNTIMED = settings(deadline=None, max_examples=40)

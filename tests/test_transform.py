@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from torchdeform import grid as grids
+from torchdeform.core import grid as grids
+from torchdeform.core.derivatives import jacobian_determinant
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image, resample
+from torchdeform.core.transform import Affine, Displacement, Transform
+from torchdeform.core.warp import invert
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image, resample
-from torchdeform.stencil import jacobian_determinant
-from torchdeform.transform import Affine, Displacement, Transform
-from torchdeform.warp import invert
 
 UNTIMED = settings(deadline=None, max_examples=30)
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

@@ -9,15 +9,15 @@ import SimpleITK as sitk
 import torch
 import typer
 
-from torchdeform import cli
-from torchdeform.commands.transforms import VERBS
-from torchdeform.image import Image
+from torchdeform.cli import main as cli
+from torchdeform.cli.transforms import VERBS
+from torchdeform.core.image import Image
+from torchdeform.core.transform import Affine, Transform
+from torchdeform.core.warp import invert
 from torchdeform.io import read_displacement, read_image, write_displacement, write_image
 from torchdeform.io.labels import read_labels
 from torchdeform.io.points import Points, read_points, write_points
 from torchdeform.io.transforms import read_transform, write_transform
-from torchdeform.transform import Affine, Transform
-from torchdeform.warp import invert
 
 DIMS = [2, 3]
 

@@ -11,10 +11,10 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from torchdeform.diagnostics import smallest_determinant
+from torchdeform.core.diagnostics import smallest_determinant
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import compose, invert, max_voxels, sample, warp
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.warp import compose, invert, max_voxels, sample, warp
 
 UNTIMED = settings(deadline=None, max_examples=40)
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

@@ -3,6 +3,9 @@
 import difflib
 from collections.abc import Iterable
 
+# Set in the environment: the shell shows the traceback of an error.
+TRACEBACK = "TORCHDEFORM_TRACEBACK"
+
 
 class TorchdeformError(Exception):
     """Base of every error that this package raises on purpose."""
@@ -28,3 +31,17 @@ def require_choice(value: object, choices: Iterable[object], where: str) -> None
     if value not in known:
         names = [str(choice) for choice in known]
         raise InputError(f"{where} must be one of {', '.join(names)}, got {value!r}{nearest_name(str(value), names)}")
+
+
+def explain(error: Exception) -> tuple[str, int]:
+    """Return what to tell a person about an error, and the exit code."""
+    if isinstance(error, InputError):
+        return str(error), 2
+    if isinstance(error, ComputationError):
+        return str(error), 1
+    if isinstance(error, MemoryError) or "out of memory" in str(error) or "allocate memory" in str(error):
+        return "there is not enough memory for images of this size; use a machine with more, or smaller images", 1
+    if isinstance(error, OSError):
+        return f"{error.filename or 'a file'}: {error.strerror or error}; check the disk and its permissions", 1
+    text = " ".join(str(error).split())
+    return f"unexpected {type(error).__name__}: {text}; set {TRACEBACK}=1 to see where, and report it", 1

@@ -83,7 +83,7 @@ def write_cohort(folder: Path, rows: Sequence[dict[str, str]], engine: str) -> P
 
 
 def start(cohort: Path) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "torchdeform.cli", "batch", str(cohort)]
+    command = [sys.executable, "-m", "torchdeform.cli.main", "batch", str(cohort)]
     log = (cohort.parent / "batch.log").open("ab")
     return subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
 

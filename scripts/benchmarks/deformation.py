@@ -21,6 +21,9 @@ from torch import Tensor
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
+from torchdeform.core.derivatives import jacobian_determinant  # noqa: E402
+from torchdeform.core.diagnostics import diagnose  # noqa: E402
+from torchdeform.core.grid import Grid  # noqa: E402
 from torchdeform.deformation.monitors import mean_value  # noqa: E402
 from torchdeform.deformation.velocity import VelocityName  # noqa: E402
 from torchdeform.deformation.versions import (  # noqa: E402
@@ -29,14 +32,11 @@ from torchdeform.deformation.versions import (  # noqa: E402
     grid_from_target_monitor,
     track_moving_monitor,
 )
-from torchdeform.diagnostics import diagnose  # noqa: E402
 from torchdeform.fem import SolverSettings, Weights, solve_div_curl  # noqa: E402
 from torchdeform.fem.assembly import assemble, constrain_matrix  # noqa: E402
 from torchdeform.fem.boundary import fixed_unknowns  # noqa: E402
 from torchdeform.fem.form import div_curl_form  # noqa: E402
 from torchdeform.fem.operator import assemble_load  # noqa: E402
-from torchdeform.grid import Grid  # noqa: E402
-from torchdeform.stencil import jacobian_determinant  # noqa: E402
 
 WAYS: tuple[VelocityName, ...] = ("direct", "poisson", "div_curl")
 VERSIONS = {1: grid_from_initial_monitor, 2: grid_from_target_monitor}

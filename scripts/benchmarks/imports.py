@@ -17,7 +17,7 @@ CASES = {
     "import torchdeform": "import torchdeform",
     "all public names": "import torchdeform; [getattr(torchdeform, name) for name in torchdeform.__all__]",
     "import torchdeform.nn": "import torchdeform.nn",
-    "torchdeform --help": "import sys; from torchdeform.cli import torchdeform; sys.exit(torchdeform(['--help']))",
+    "torchdeform --help": "import sys; from torchdeform.cli.main import torchdeform; sys.exit(torchdeform(['--help']))",
 }
 
 

@@ -21,10 +21,10 @@ from machine import describe_machine
 from torch import Tensor
 
 import torchdeform as td
-from torchdeform.diagnostics import one_sided_determinant
+from torchdeform.core.diagnostics import one_sided_determinant
 from torchdeform.fem import Weights
-from torchdeform.fem.spectral import TransformSolver
-from torchdeform.registration.similarity import make_similarity
+from torchdeform.fem.fast_transform import TransformSolver
+from torchdeform.metrics.similarity import make_similarity
 
 _SHAPES = ((128, 128, 128), (1024, 1024))
 _QUICK = ((32, 32, 32), (128, 128))

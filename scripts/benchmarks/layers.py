@@ -20,7 +20,7 @@ from torch import Tensor, nn
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from torchdeform.grid import Grid  # noqa: E402
+from torchdeform.core.grid import Grid  # noqa: E402
 from torchdeform.nn import FlowIntegrator, JacobianCurlHead, RandomDeformation, SpatialTransformer  # noqa: E402
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")

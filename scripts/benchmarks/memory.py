@@ -1,4 +1,4 @@
-"""Peak memory of registrations from files to files, beside what `torchdeform.memory.estimate` says.
+"""Peak memory of registrations from files to files, beside what `torchdeform.pipeline.memory.estimate` says.
 
 Each case runs in a process of its own: python scripts/benchmarks/memory.py [--quick]
 """
@@ -32,9 +32,9 @@ def run(case: Case) -> int:
 
     import torch
 
-    from torchdeform.cli import main as register
-    from torchdeform.grid import Grid
-    from torchdeform.image import Image
+    from torchdeform.cli.main import main as register
+    from torchdeform.core.grid import Grid
+    from torchdeform.core.image import Image
     from torchdeform.io import write_image
 
     dim, n, channels, similarity, start = case
@@ -70,8 +70,8 @@ def measure(case: Case) -> int:
 
 def estimated(case: Case) -> int:
     """Return what the package expects of a case, in bytes."""
-    from torchdeform.grid import Grid
-    from torchdeform.memory import estimate
+    from torchdeform.core.grid import Grid
+    from torchdeform.pipeline.memory import estimate
 
     dim, n, channels, similarity, start = case
     return estimate(Grid((n,) * dim), channels=channels, similarity=similarity, start=start)

@@ -136,7 +136,7 @@ def _torchdeform(preset: str) -> Tool:
         td.write_transform(transform, job.folder / "transform.h5")
         return lambda: _itk_transform(job, job.folder / "transform.h5")
 
-    ours = ("torchdeform", "torchdeform.pair", "torchdeform.registration.deformable")
+    ours = ("torchdeform", "torchdeform.pipeline.register", "torchdeform.registration.deformable")
     needs = (*ours, "SimpleITK", "pydantic", "pydantic.dataclasses", "pydantic.type_adapter", "yaml")
     return Tool("torchdeform", needs, f"preset {preset}: alignment and deformation", register)
 

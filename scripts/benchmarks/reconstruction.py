@@ -22,6 +22,9 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+from torchdeform.core.derivatives import CURL_PAIRS, curl, divergence, jacobian_determinant
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import max_voxels
 from torchdeform.deformation.prescribed import PrescribedSolution, from_jacobian_and_curl
 from torchdeform.deformation.reconstruction import reconstruct
 from torchdeform.fem import SolverSettings, Weights, solve_div_curl
@@ -29,9 +32,6 @@ from torchdeform.fem.assembly import assemble, constrain_matrix
 from torchdeform.fem.boundary import fixed_unknowns
 from torchdeform.fem.form import div_curl_form
 from torchdeform.fem.operator import assemble_load
-from torchdeform.grid import Grid
-from torchdeform.stencil import CURL_PAIRS, curl, divergence, jacobian_determinant
-from torchdeform.warp import max_voxels
 
 # Unknowns beyond which the factors of a sparse direct solver outgrow the memory of a desktop.
 DIRECT_LIMIT = 25_000

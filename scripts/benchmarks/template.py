@@ -24,12 +24,12 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 import torchdeform as td  # noqa: E402
-from torchdeform.image import luminance  # noqa: E402
-from torchdeform.interpolation import interpolator  # noqa: E402
-from torchdeform.registration.pyramid import restrict  # noqa: E402
+from torchdeform.core.image import luminance  # noqa: E402
+from torchdeform.core.interpolation import interpolator  # noqa: E402
+from torchdeform.core.resampling import restrict  # noqa: E402
+from torchdeform.core.warp import max_voxels, voxels  # noqa: E402
 from torchdeform.registration.template import Template, average_shape, build_template  # noqa: E402
-from torchdeform.report.gallery import write_gallery  # noqa: E402
-from torchdeform.warp import max_voxels, voxels  # noqa: E402
+from torchdeform.report.figures import write_gallery  # noqa: E402
 
 COUNT = 6
 SHARES = (0.06, 0.12)  # longest velocity over the longest side

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from torchdeform.batch.cohort import Cohort, read_cohort
+from torchdeform.cohort.schema import Cohort, read_cohort
 
 
 @pytest.fixture

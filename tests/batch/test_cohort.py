@@ -4,11 +4,11 @@ import json
 
 import pytest
 
-from torchdeform.batch.cohort import Cohort, cohort_schema, read_cohort
-from torchdeform.batch.strict import expand
-from torchdeform.cli import torchdeform
-from torchdeform.config import configs_folder, load_settings, read_yaml_lines
+from torchdeform.cli.main import torchdeform
+from torchdeform.cohort.schema import Cohort, cohort_schema, read_cohort
+from torchdeform.cohort.settings import expand
 from torchdeform.errors import InputError
+from torchdeform.pipeline.config import configs_folder, load_settings, read_yaml_lines
 
 _LIST = "pairs:\n  list:\n    - fixed: a.png\n      moving: b.png\n"
 _PATTERN = "pairs:\n  pattern:\n    files: '{subject}.png'\n    pairing: all\n"
@@ -26,7 +26,7 @@ def test_paths_are_relative_to_the_file_and_variables_filled_in(cohort_of, tmp_p
 def test_what_a_variable_holds_is_no_pattern(touch, cohort_of, monkeypatch):
     folder = touch(["set [1]/a.png", "set 1/b.png"])
     monkeypatch.setenv("IMAGES", str(folder / "set [1]"))
-    from torchdeform.batch.pairings import find_images
+    from torchdeform.cohort.pairs import find_images
 
     cohort = cohort_of("images:\n  files: $IMAGES/*.png\n")
     assert [one.path.name for one in find_images(cohort.images)] == ["a.png"]

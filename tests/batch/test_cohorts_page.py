@@ -4,8 +4,8 @@ import re
 
 import pytest
 
-from torchdeform.batch.cohort import read_cohort
-from torchdeform.cli import torchdeform
+from torchdeform.cli.main import torchdeform
+from torchdeform.cohort.schema import read_cohort
 
 
 def blocks(root, language):

@@ -14,18 +14,18 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from torchdeform.batch.engine import local
-from torchdeform.batch.engine.local import LocalExecutor, environment, open_local, usable_cores, visible_gpus
-from torchdeform.batch.engine.settings import ClusterSettings, EngineSettings
-from torchdeform.batch.engine.worker import EngineError, TimeLimit, Worker, WorkerLost
-from torchdeform.batch.job import Job
-from torchdeform.batch.needs import measure
-from torchdeform.batch.run import Event, run
-from torchdeform.batch.summary import log_of
-from torchdeform.batch.task import Task
+from torchdeform.cohort.estimate import measure
+from torchdeform.cohort.executors import local
+from torchdeform.cohort.executors.local import LocalExecutor, environment, open_local, usable_cores, visible_gpus
+from torchdeform.cohort.executors.worker import EngineError, TimeLimit, Worker, WorkerLost
+from torchdeform.cohort.plan import Job
+from torchdeform.cohort.run import Event, run
+from torchdeform.cohort.settings import ClusterSettings, EngineSettings
+from torchdeform.cohort.summary import log_of
+from torchdeform.cohort.task import Task
 from torchdeform.errors import ComputationError
 from torchdeform.io import write_image
-from torchdeform.pair import PairFiles
+from torchdeform.pipeline.register import PairFiles
 from torchdeform.registration.settings import RegistrationSettings
 
 FAST = RegistrationSettings(align="none", similarity="ssd", steps=(2,), length=8.0)
@@ -162,8 +162,8 @@ def test_shutdown_now_ends_what_runs_and_cancels_what_waits():
 
 def test_workers_end_when_their_parent_is_killed():
     code = (
-        "import os, time; from torchdeform.batch.engine.local import LocalExecutor\n"
-        "from torchdeform.batch.engine.worker import Worker\n"
+        "import os, time; from torchdeform.cohort.executors.local import LocalExecutor\n"
+        "from torchdeform.cohort.executors.worker import Worker\n"
         "pool = LocalExecutor([Worker()])\n"
         "print(pool.submit(os.getpid).result(), flush=True)\n"
         "pool.submit(time.sleep, 600.0).result()\n"
@@ -177,8 +177,8 @@ def test_workers_end_when_their_parent_is_killed():
 
 
 def test_processes_that_do_not_start_stop_everything(monkeypatch):
-    monkeypatch.setattr("torchdeform.batch.engine.worker.sys.executable", "/bin/false")
-    monkeypatch.setattr("torchdeform.batch.engine.worker.sleep", lambda seconds: None)
+    monkeypatch.setattr("torchdeform.cohort.executors.worker.sys.executable", "/bin/false")
+    monkeypatch.setattr("torchdeform.cohort.executors.worker.sleep", lambda seconds: None)
     with pytest.raises(EngineError, match="do not start"):
         Worker().call(math.sqrt, 4.0)
 
@@ -277,7 +277,7 @@ def test_settings_that_contradict_are_refused(settings, sentence):
 
 
 def test_a_scheduler_that_is_not_there_is_named(jobs, tmp_path, monkeypatch):
-    dask = pytest.importorskip("torchdeform.batch.engine.dask")
+    dask = pytest.importorskip("torchdeform.cohort.executors.dask")
     pytest.importorskip("distributed")
     monkeypatch.setattr(dask, "_CONNECT", "0.5s")
     monkeypatch.setattr(dask, "_measured", lambda jobs: [0] * len(jobs))
@@ -304,7 +304,7 @@ def test_queues_are_asked_for_what_is_written(kind, lines, tmp_path):
     pytest.importorskip("dask_jobqueue")
     import dask
 
-    from torchdeform.batch.engine.dask import make_queue
+    from torchdeform.cohort.executors.dask import make_queue
 
     cluster = ClusterSettings(
         kind=kind,
@@ -329,7 +329,7 @@ def test_queues_are_asked_for_what_is_written(kind, lines, tmp_path):
 
 def test_pairs_ask_for_what_all_workers_declare(jobs):
     distributed = pytest.importorskip("distributed")
-    from torchdeform.batch.engine.dask import _executors, declared_by
+    from torchdeform.cohort.executors.dask import _executors, declared_by
 
     common = {"processes": False, "n_workers": 1, "dashboard_address": "127.0.0.1:0"}
     with (

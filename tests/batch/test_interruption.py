@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from torchdeform.cli import torchdeform
+from torchdeform.cli.main import torchdeform
 from torchdeform.io import write_image
 
 COHORT = """\
@@ -39,7 +39,7 @@ def write(folder: Path, names: str, moving: str = "moving.png") -> Path:
 
 
 def start(cohort: Path) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "torchdeform.cli", "batch", str(cohort)]
+    command = [sys.executable, "-m", "torchdeform.cli.main", "batch", str(cohort)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

@@ -7,18 +7,17 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchdeform.batch.cohort import read_cohort
-from torchdeform.batch.costs import Costs, estimate
-from torchdeform.batch.job import Job, register_job
-from torchdeform.batch.plan import description, plan
-from torchdeform.cli import torchdeform
-from torchdeform.config import configs_folder, load_settings
+from torchdeform.cli.main import torchdeform
+from torchdeform.cohort.estimate import Costs, estimate
+from torchdeform.cohort.plan import Job, description, plan, register_job
+from torchdeform.cohort.schema import read_cohort
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image
 from torchdeform.io import write_image
 from torchdeform.io.learn2reg import voxel_displacement, write_voxel_displacement
-from torchdeform.pair import PairFiles
+from torchdeform.pipeline.config import configs_folder, load_settings
+from torchdeform.pipeline.register import PairFiles
 
 _PATTERN = "pairs: {pattern: {files: 'sub-{subject}_ses-{session}.png', pairing: consecutive, within: [subject]}}\n"
 _IMAGES = [f"sub-{subject}_ses-{session}.png" for subject in ("a", "b") for session in (1, 2)]
@@ -146,7 +145,7 @@ def test_submission_is_read_as_the_challenge_reads_it(make_image, make_displacem
     assert displacement.shape == (*fixed.grid.shape[::-1], 3)
     identity = np.meshgrid(*map(np.arange, displacement.shape[:3]), indexing="ij")
     warped = map_coordinates(values, identity + displacement.transpose(3, 0, 1, 2), order=1, cval=0.0)
-    from torchdeform.image import resample
+    from torchdeform.core.image import resample
 
     ours = resample(moving, fixed, u)[0, 0].numpy().transpose()
     inside = (

@@ -10,16 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from torchdeform.batch.engine.base import Engine
-from torchdeform.batch.engine.settings import EngineSettings
-from torchdeform.batch.engine.worker import EngineError, TimeLimit, WorkerLost
-from torchdeform.batch.job import Job
-from torchdeform.batch.plan import Problem
-from torchdeform.batch.run import Event, review, run
-from torchdeform.batch.state import Journal
-from torchdeform.batch.task import DONE, FAILED, Report, Task
+from torchdeform.cohort.executors.local import Engine
+from torchdeform.cohort.executors.worker import EngineError, TimeLimit, WorkerLost
+from torchdeform.cohort.journal import Journal
+from torchdeform.cohort.plan import Job, Problem
+from torchdeform.cohort.run import Event, review, run
+from torchdeform.cohort.settings import EngineSettings
+from torchdeform.cohort.task import DONE, FAILED, Report, Task
 from torchdeform.errors import ComputationError, InputError
-from torchdeform.pair import PairFiles
+from torchdeform.pipeline.register import PairFiles
 from torchdeform.registration.settings import RegistrationSettings
 
 Work = Callable[[Task], Report]
@@ -31,7 +30,7 @@ class Feigned:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.ran: list[str] = []
         self.special: dict[str, Work] = {}
-        monkeypatch.setattr("torchdeform.batch.run._open", self._open)
+        monkeypatch.setattr("torchdeform.cohort.run._open", self._open)
 
     @contextmanager
     def _open(self, settings: EngineSettings, jobs: Sequence[Job], out: Path) -> Iterator[Engine]:
@@ -190,7 +189,7 @@ def test_a_lost_cluster_stops_the_run(monkeypatch, jobs, out):
     def opened(*_):
         yield Engine(lambda job: Lost(), 2)
 
-    monkeypatch.setattr("torchdeform.batch.run._open", opened)
+    monkeypatch.setattr("torchdeform.cohort.run._open", opened)
     with pytest.raises(ComputationError, match="connection to the cluster was lost"):
         run(jobs, out, EngineSettings())
     assert set(statuses(out).values()) == {"waiting"}

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchdeform.batch.entry import clean, image_name, pair_name, select
-from torchdeform.batch.learn2reg import submission_name
-from torchdeform.batch.pairings import find_images
-from torchdeform.batch.patterns import fill, find, literal, only, part_names
-from torchdeform.batch.sources import entries, named_images
+from torchdeform.cohort.learn2reg import submission_name
+from torchdeform.cohort.names import clean, image_name, pair_name, select
+from torchdeform.cohort.pairs import entries, find_images, named_images
+from torchdeform.cohort.patterns import fill, find, literal, only, part_names
 from torchdeform.errors import InputError
 
 _BIDS = [

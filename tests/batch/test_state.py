@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from torchdeform.batch.job import Job
-from torchdeform.batch.state import JOURNAL, Journal, Record
-from torchdeform.batch.task import DONE, FAILED, Report
+from torchdeform.cohort.journal import JOURNAL, Journal, Record
+from torchdeform.cohort.plan import Job
+from torchdeform.cohort.task import DONE, FAILED, Report
 from torchdeform.errors import InputError
-from torchdeform.pair import PairFiles
+from torchdeform.pipeline.register import PairFiles
 from torchdeform.registration.settings import RegistrationSettings
 
 REPORT = Report(DONE, "", 1.5, 4, 0, {"folds": 0, "dice_after": 0.9}, ("warped.png", "result.json"))
@@ -119,7 +119,7 @@ def test_the_print_depends_on_all_that_results_depend_on(tmp_path, job, change):
 
 def test_the_print_depends_on_the_version(tmp_path, job, monkeypatch):
     before = fingerprint(tmp_path, job)
-    monkeypatch.setattr("torchdeform.batch.state.__version__", "another")
+    monkeypatch.setattr("torchdeform.cohort.journal.__version__", "another")
     assert fingerprint(tmp_path, job) != before
 
 
@@ -154,7 +154,7 @@ def test_a_file_of_the_same_size_and_date_is_not_read_again(tmp_path, job, monke
     for path in (job.files.fixed, job.files.moving):
         os.utime(path, (1e9, 1e9))
     before = fingerprint(tmp_path, job)
-    monkeypatch.setattr("torchdeform.batch.state.hashlib.file_digest", lambda *_: pytest.fail("a file was read"))
+    monkeypatch.setattr("torchdeform.cohort.journal.hashlib.file_digest", lambda *_: pytest.fail("a file was read"))
     assert fingerprint(tmp_path, job) == before
 
 
@@ -168,7 +168,7 @@ def test_the_date_of_a_file_just_written_is_not_trusted(tmp_path, job):
 
 def test_a_record_is_one_line_of_json_on_the_disk(tmp_path, monkeypatch):
     synced = []
-    monkeypatch.setattr("torchdeform.batch.state.os.fsync", lambda file: synced.append(os.fstat(file).st_size))
+    monkeypatch.setattr("torchdeform.cohort.journal.os.fsync", lambda file: synced.append(os.fstat(file).st_size))
     with Journal(tmp_path) as journal:
         journal.record(Record("a", "1", Report(FAILED, "line one\nline two")))
     text = (tmp_path / JOURNAL).read_text(encoding="utf-8")

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from torchdeform.batch.job import Job
-from torchdeform.batch.plan import Problem
-from torchdeform.batch.summary import COLUMNS, log_of, summarise
-from torchdeform.batch.task import DONE, FAILED, Report
-from torchdeform.pair import PairFiles
+from torchdeform.cohort.plan import Job, Problem
+from torchdeform.cohort.summary import COLUMNS, log_of, summarise
+from torchdeform.cohort.task import DONE, FAILED, Report
+from torchdeform.pipeline.register import PairFiles
 from torchdeform.registration.settings import RegistrationSettings
 
 NASTY = """<script>alert("1")</script> & "quotes" 'too'"""

@@ -9,17 +9,17 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchdeform.batch.cohort import Cohort, read_cohort
-from torchdeform.batch.template.build import Built, build
-from torchdeform.batch.template.settings import TemplateSettings
-from torchdeform.cli import torchdeform
+from torchdeform.cli.main import torchdeform
+from torchdeform.cohort.schema import Cohort, read_cohort
+from torchdeform.cohort.settings import TemplateSettings
+from torchdeform.cohort.template import Built, build
+from torchdeform.core.flow import integrate
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
+from torchdeform.core.warp import warp
 from torchdeform.errors import ComputationError, InputError
-from torchdeform.flow import integrate
-from torchdeform.grid import Grid
-from torchdeform.image import Image
 from torchdeform.io import read_image, read_labels, read_transform, write_image, write_labels
 from torchdeform.registration.template import AveragingSettings, build_template
-from torchdeform.warp import warp
 
 GRID = Grid((32, 36))
 COHORT = """

@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
+from torchdeform.core.derivatives import CURL_PAIRS, curl, jacobian_determinant
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import max_voxels
 from torchdeform.deformation.averages import average_maps
 from torchdeform.deformation.prescribed import NewtonSettings
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.solvers.solution import Status
-from torchdeform.stencil import CURL_PAIRS, curl, jacobian_determinant
-from torchdeform.warp import max_voxels
+from torchdeform.solvers.base import Status
 
 GRIDS = [Grid((41, 41)), Grid((17, 17, 17))]
 

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
+from torchdeform.core.derivatives import jacobian_determinant
+from torchdeform.core.diagnostics import diagnose
+from torchdeform.core.grid import Grid
 from torchdeform.deformation import versions
 from torchdeform.deformation.corrections import correct_determinant, remove_folds
 from torchdeform.deformation.monitors import MonitorSettings, mean_value, ring_monitor
 from torchdeform.deformation.versions import DeformationSettings, grid_from_initial_monitor
-from torchdeform.diagnostics import diagnose
 from torchdeform.errors import ComputationError
-from torchdeform.grid import Grid
-from torchdeform.stencil import jacobian_determinant
 
 FLOW_ONLY = DeformationSettings(corrections=0, remove_folds=False)
 

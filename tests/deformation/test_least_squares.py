@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchdeform.deformation.least_squares import Differences, clear_boundary, dots
-from torchdeform.grid import Grid
+from torchdeform.core.derivatives import CURL_PAIRS, cofactors, curl, divergence, jacobian_determinant, map_jacobian
+from torchdeform.core.grid import Grid
+from torchdeform.deformation.finite_differences import Differences, clear_boundary, dots
 from torchdeform.solvers.cg import conjugate_gradient
-from torchdeform.stencil import CURL_PAIRS, cofactors, curl, divergence, jacobian_determinant, map_jacobian
 
 UNTIMED = settings(deadline=None, max_examples=30)
 

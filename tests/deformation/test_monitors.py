@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
+from torchdeform.core.grid import Grid
 from torchdeform.deformation.monitors import (
     MonitorSettings,
     ball_monitor,
@@ -24,7 +25,6 @@ from torchdeform.deformation.monitors import (
     smooth,
 )
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 WIDE = MonitorSettings(f_min=0.1, f_max=2.0, dtype=torch.float64)

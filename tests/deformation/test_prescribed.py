@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
+from torchdeform.core.derivatives import CURL_PAIRS, curl, jacobian_determinant
+from torchdeform.core.diagnostics import diagnose, smallest_determinant
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import max_voxels
 from torchdeform.deformation.prescribed import NewtonSettings, PrescribedSolution, from_jacobian_and_curl
-from torchdeform.diagnostics import diagnose, smallest_determinant
 from torchdeform.errors import InputError
 from torchdeform.fem.boundary import fixed_unknowns
-from torchdeform.grid import Grid
-from torchdeform.solvers.solution import Status
-from torchdeform.stencil import CURL_PAIRS, curl, jacobian_determinant
-from torchdeform.warp import max_voxels
+from torchdeform.solvers.base import Status
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 UNTIMED = settings(deadline=None, max_examples=25)

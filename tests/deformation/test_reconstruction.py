@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
+from torchdeform.core.derivatives import curl, divergence, jacobian_determinant
+from torchdeform.core.diagnostics import diagnose
+from torchdeform.core.grid import Grid
 from torchdeform.deformation.reconstruction import Reconstruction, reconstruct
-from torchdeform.diagnostics import diagnose
 from torchdeform.errors import InputError
 from torchdeform.fem import solve_div_curl
-from torchdeform.grid import Grid
-from torchdeform.stencil import curl, divergence, jacobian_determinant
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 UNTIMED = settings(deadline=None, max_examples=25)

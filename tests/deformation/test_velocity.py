@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
+from torchdeform.core.derivatives import CURL_PAIRS, curl, divergence
+from torchdeform.core.grid import Grid
 from torchdeform.deformation.velocity import find_velocity
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.stencil import CURL_PAIRS, curl, divergence
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 WAYS = ["direct", "poisson", "div_curl"]

@@ -13,6 +13,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
+from torchdeform.core.derivatives import curl, jacobian_determinant
+from torchdeform.core.diagnostics import diagnose
+from torchdeform.core.flow import OdeSolver
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import compose, max_voxels
 from torchdeform.deformation.monitors import mean_value
 from torchdeform.deformation.versions import (
     DeformationSettings,
@@ -20,12 +25,7 @@ from torchdeform.deformation.versions import (
     grid_from_target_monitor,
     track_moving_monitor,
 )
-from torchdeform.diagnostics import diagnose
 from torchdeform.errors import InputError
-from torchdeform.flow import OdeSolver
-from torchdeform.grid import Grid
-from torchdeform.stencil import curl, jacobian_determinant
-from torchdeform.warp import compose, max_voxels
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 WAYS = ["direct", "poisson", "div_curl"]

@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
+from torchdeform.core.derivatives import determinant, jacobian_determinant
+from torchdeform.core.diagnostics import diagnose
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import sample
 from torchdeform.deformation.volumes import nodal_volumes, simulate_volume_change
-from torchdeform.diagnostics import diagnose
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.fem.boundary import fixed_unknowns
-from torchdeform.grid import Grid
-from torchdeform.solvers.solution import Status
-from torchdeform.stencil import determinant, jacobian_determinant
-from torchdeform.warp import sample
+from torchdeform.solvers.base import Status
 
 GRIDS = [Grid((48, 40), (1.0, 1.2)), Grid((28, 26, 30), (1.0, 1.2, 0.9))]
 CENTRES = {1: (0.3, 0.3, 0.35), 2: (0.66, 0.62, 0.5), 3: (0.3, 0.75, 0.6)}

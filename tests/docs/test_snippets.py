@@ -15,8 +15,8 @@ from types import ModuleType
 import pytest
 import yaml
 
-from torchdeform.cli import main, torchdeform
-from torchdeform.config import load_settings
+from torchdeform.cli.main import main, torchdeform
+from torchdeform.pipeline.config import load_settings
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(p.relative_to(ROOT).as_posix() for p in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
@@ -83,7 +83,7 @@ def quick(monkeypatch):
         settings = load_settings(*arguments)  # type: ignore[arg-type]
         return replace(settings, steps=tuple(min(3, n) for n in settings.steps))
 
-    monkeypatch.setattr("torchdeform.commands.register.load_settings", few)
+    monkeypatch.setattr("torchdeform.cli.register.load_settings", few)
 
 
 @pytest.fixture

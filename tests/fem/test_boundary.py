@@ -5,6 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.fem.boundary import (
     FIXES,
@@ -16,7 +17,6 @@ from torchdeform.fem.boundary import (
     outward_flux,
     resolve_boundary,
 )
-from torchdeform.grid import Grid
 
 
 @pytest.mark.parametrize("dim", [2, 3])

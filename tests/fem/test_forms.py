@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
+from torchdeform.core.derivatives import CURL_PAIRS
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.fem import quadrature
 from torchdeform.fem.assembly import assemble, constrain_matrix, to_csr
@@ -18,8 +20,6 @@ from torchdeform.fem.form import Form, Row, Term, div_curl_form, gradient_form
 from torchdeform.fem.operator import apply_form, assemble_load, form_diagonal
 from torchdeform.fem.quadrature import adjoint, apply_by_quadrature, evaluate, interpolate, load_by_quadrature
 from torchdeform.fem.weights import Weights
-from torchdeform.grid import Grid
-from torchdeform.stencil import CURL_PAIRS
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 GRIDS = [Grid((4, 6), (0.5, 1.3)), Grid((2, 3), (1.0, 0.2)), Grid((3, 4, 3), (0.7, 1.0, 1.4)), Grid((2, 2, 2))]

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
+from torchdeform.core.derivatives import CURL_PAIRS
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.fem.boundary import Face, faces, fixed_unknowns
 from torchdeform.fem.div_curl import SolverSettings, curl_potential, solve_div_curl
@@ -15,9 +17,7 @@ from torchdeform.fem.form import div_curl_form, gradient_form
 from torchdeform.fem.operator import assemble_load
 from torchdeform.fem.quadrature import adjoint, evaluate
 from torchdeform.fem.weights import Weights
-from torchdeform.grid import Grid
-from torchdeform.solvers.solution import Status
-from torchdeform.stencil import CURL_PAIRS
+from torchdeform.solvers.base import Status
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 CG = SolverSettings(solver="cg")

@@ -6,15 +6,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.fem.assembly import assemble
 from torchdeform.fem.boundary import Face, constrain, faces, fixed_unknowns
+from torchdeform.fem.fast_transform import TransformSolver, solve_poisson, transform_is_exact
 from torchdeform.fem.form import div_curl_form, gradient_form
 from torchdeform.fem.operator import apply_form
-from torchdeform.fem.spectral import TransformSolver, solve_poisson, transform_is_exact
 from torchdeform.fem.weights import Weights
-from torchdeform.grid import Grid
-from torchdeform.solvers import transforms
+from torchdeform.solvers import sine_cosine as transforms
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 GRIDS = [Grid((5, 7), (0.5, 1.3)), Grid((3, 4), (2.0, 0.3)), Grid((4, 3, 5), (0.7, 1.0, 1.4)), Grid((2, 5, 3))]

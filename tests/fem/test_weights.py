@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.fem.weights import Weights
-from torchdeform.grid import Grid
 
 GRID = Grid((4, 5))
 

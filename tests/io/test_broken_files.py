@@ -11,12 +11,12 @@ import pytest
 import SimpleITK as sitk
 import torch
 
-from torchdeform.check import preflight
-from torchdeform.cli import main
+from torchdeform.cli.main import main
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image
 from torchdeform.io import read_displacement, read_image, write_image
+from torchdeform.pipeline.preflight import preflight
 
 SHAPE = (9, 10, 11)
 Make = Callable[[Path], None]

@@ -8,9 +8,9 @@ import pytest
 import SimpleITK as sitk
 import torch
 
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image
 from torchdeform.io import read_image, write_image
 from torchdeform.io.images import ending_like
 

@@ -3,7 +3,7 @@
 import torch
 
 from torchdeform.io import read_image, read_labels, write_image
-from torchdeform.registration.evaluation import dice
+from torchdeform.metrics.evaluation import dice
 
 
 def test_a_grey_picture_saved_in_colour_is_one_label_image(tmp_path, make_image):

@@ -11,8 +11,8 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from torchdeform.grid import Grid
-from torchdeform.image import Image
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.io import read_image, write_image
 
 ENDINGS = [".nii", ".nii.gz", ".mha", ".mhd", ".nrrd", ".nhdr"]

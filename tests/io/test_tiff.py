@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image
 from torchdeform.io import read_image, write_image
 
 tifffile = pytest.importorskip("tifffile")

@@ -8,12 +8,12 @@ import pytest
 import SimpleITK as sitk
 import torch
 
+from torchdeform.core.image import resample
+from torchdeform.core.transform import Affine, Displacement, Transform
+from torchdeform.core.warp import compose, invert, max_voxels
 from torchdeform.errors import InputError
-from torchdeform.image import resample
 from torchdeform.io import read_displacement, read_image, write_displacement, write_image, write_transform
 from torchdeform.io.transforms import read_transform
-from torchdeform.transform import Affine, Displacement, Transform
-from torchdeform.warp import compose, invert, max_voxels
 
 SHAPES = {2: ((40, 52), (45, 38)), 3: ((18, 22, 26), (20, 17, 24))}
 SPACINGS = {2: ((1.3, 0.7), (0.9, 1.1)), 3: ((2.2, 0.7, 1.1), (1.4, 1.3, 1.2))}

@@ -7,11 +7,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchdeform.diagnostics import diagnose, inverse_error
+from torchdeform.core.derivatives import curl
+from torchdeform.core.diagnostics import diagnose, inverse_error
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
 from torchdeform.nn import RandomDeformation
-from torchdeform.stencil import curl
 
 GRIDS = [Grid((48, 40), (1.0, 1.5)), Grid((20, 16, 18), (1.0, 2.0, 1.0))]
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from torchdeform import nn as layers
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
+from torchdeform.core.warp import warp
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image
-from torchdeform.warp import warp
 
 GRIDS = [Grid((13, 17), (1.0, 1.5)), Grid((9, 11, 10), (2.0, 1.0, 1.5))]
 ROUND_TRIPS = [

@@ -5,12 +5,12 @@ import copy
 import pytest
 import torch
 
-from torchdeform.diagnostics import diagnose
+from torchdeform.core.derivatives import CURL_PAIRS, jacobian_determinant
+from torchdeform.core.diagnostics import diagnose
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
 from torchdeform.nn import JacobianCurlHead
 from torchdeform.nn.heads import draw_back, flow_to_monitor, with_mean_one
-from torchdeform.stencil import CURL_PAIRS, jacobian_determinant
 
 GRIDS = [Grid((24, 20), (1.0, 1.5)), Grid((12, 10, 14), (1.0, 2.0, 1.0))]
 

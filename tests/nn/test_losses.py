@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import invert
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
 from torchdeform.nn import (
     CurlLoss,
     DeterminantLoss,
@@ -14,7 +15,6 @@ from torchdeform.nn import (
     SimilarityLoss,
 )
 from torchdeform.nn.losses import SIMILARITIES
-from torchdeform.warp import invert
 
 GRIDS = [Grid((9, 8), (1.0, 1.5)), Grid((7, 6, 8), (1.0, 2.0, 1.0))]
 

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from torchdeform.diagnostics import diagnose
+from torchdeform.core.diagnostics import diagnose
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import warp
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
 from torchdeform.nn import DeformableRegistration, SimilarityLoss
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.warp import warp
 
 GRIDS = [Grid((32, 28), (1.0, 1.5)), Grid((14, 16, 12), (1.0, 2.0, 1.0))]
 

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from torchdeform import nn as layers
-from torchdeform.grid import Grid
+from torchdeform.core.grid import Grid
 
 GRIDS = [Grid((16, 12), (1.0, 1.5)), Grid((8, 9, 10))]
 

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import warp
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
 from torchdeform.nn import SpatialTransformer
-from torchdeform.warp import warp
 
 GRIDS = [Grid((9, 12), (1.0, 2.0)), Grid((7, 8, 9), (1.5, 1.0, 1.0))]
 

@@ -6,15 +6,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchdeform.diagnostics import diagnose, inverse_error
+from torchdeform.core.derivatives import CURL_PAIRS
+from torchdeform.core.diagnostics import diagnose, inverse_error
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.fem.boundary import fixed_unknowns
 from torchdeform.fem.form import div_curl_form
 from torchdeform.fem.operator import apply_form, assemble_load
 from torchdeform.fem.weights import Weights
-from torchdeform.grid import Grid
 from torchdeform.nn import DivCurlVelocity, FlowIntegrator
-from torchdeform.stencil import CURL_PAIRS
 
 GRIDS = [Grid((5, 4), (1.0, 1.5)), Grid((4, 3, 5), (0.8, 1.0, 1.3))]
 WEIGHTS = [(1.0, 1.0, 0.0), (1.0, 1.0, 0.4), (2.0, 0.5, 0.3)]

@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from torchdeform.flow import integrate
-from torchdeform.grid import Grid
+from torchdeform.core.flow import integrate
+from torchdeform.core.grid import Grid
 
 
 def blobs(shape: tuple[int, ...], seed: int = 0, items: int = 1) -> Tensor:

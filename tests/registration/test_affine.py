@@ -7,18 +7,18 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
+from torchdeform.core.transform import Affine
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image
-from torchdeform.registration.affine import AlignmentSettings, affine_warp, align
-from torchdeform.registration.affine_climb import climb
-from torchdeform.registration.affine_detail import DetailCorrelation
-from torchdeform.registration.affine_group import angle, exponential, generators, homogeneous, rotations
-from torchdeform.registration.affine_level import Frame, Level, Masked
-from torchdeform.registration.affine_starts import body, make_starts
+from torchdeform.metrics.correlation import DetailCorrelation
+from torchdeform.metrics.similarity import make_similarity
+from torchdeform.registration.affine.align import AlignmentSettings, affine_warp, align
+from torchdeform.registration.affine.bfgs import climb
+from torchdeform.registration.affine.lie import angle, exponential, generators, homogeneous, rotations
+from torchdeform.registration.affine.objective import Frame, Level, Masked
+from torchdeform.registration.affine.search import body, make_starts
 from torchdeform.registration.settings import ALIGNMENTS
-from torchdeform.registration.similarity import make_similarity
-from torchdeform.transform import Affine
 
 TILTED = {
     2: ((math.cos(0.4), -math.sin(0.4)), (math.sin(0.4), math.cos(0.4))),

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd import gradcheck
 
-import torchdeform.registration.banded as module
-from torchdeform.registration.banded import banded, gathering, interpolation, multiply, restriction
+import torchdeform.core.resampling as module
+from torchdeform.core.resampling import banded, gathering, interpolation, multiply, restriction
 
 LIKE = torch.zeros(0, dtype=torch.float64)
 

@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchdeform.registration.metrics.boxes import box_spread, box_sum, centres
+from torchdeform.core.resampling import box_spread, box_sum, centres
 
 
 @settings(max_examples=30, deadline=None)

@@ -7,15 +7,15 @@ import pytest
 import torch
 from pictures import bend, blobs
 
-from torchdeform.diagnostics import diagnose
+from torchdeform.core.diagnostics import diagnose
+from torchdeform.core.flow import integrate
+from torchdeform.core.fold_free import advance, relaxed
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image, resample
+from torchdeform.core.warp import compose, max_voxels, warp
 from torchdeform.errors import InputError
-from torchdeform.flow import integrate
-from torchdeform.grid import Grid
-from torchdeform.image import Image, resample
 from torchdeform.registration.deformable import register
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.registration.steps import advance, relaxed
-from torchdeform.warp import compose, max_voxels, warp
 
 QUICK = RegistrationSettings(steps=(30, 30, 20), step_length=0.5, length=6.0, window=7)
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

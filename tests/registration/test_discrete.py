@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 import torchdeform as td
-from torchdeform.diagnostics import diagnose
+from torchdeform.core.diagnostics import diagnose
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import voxels, warp
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
 from torchdeform.registration.discrete import DiscreteSettings, discrete_start
-from torchdeform.warp import voxels, warp
 
 # Shape, spacing, and a reach for a motion of 12 voxels.
 CASES = [

@@ -10,10 +10,12 @@ from hypothesis import strategies as st
 from pictures import bend
 from torch import Tensor
 
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
+from torchdeform.core.transform import Affine, Transform
+from torchdeform.core.warp import sample, warp
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image
-from torchdeform.registration.evaluation import (
+from torchdeform.metrics.evaluation import (
     carry_points,
     common_labels,
     dice,
@@ -22,9 +24,7 @@ from torchdeform.registration.evaluation import (
     hausdorff,
     landmark_distances,
 )
-from torchdeform.registration.guidance import Guidance
-from torchdeform.transform import Affine, Transform
-from torchdeform.warp import sample, warp
+from torchdeform.registration.problem import Guidance
 
 
 def surface_by_counting(region: Tensor) -> list[tuple[int, ...]]:
@@ -106,7 +106,7 @@ def test_the_right_map_fits_labels_and_landmarks():
         fixed_points=points,
         moving_points=points + sample(truth, points, grid),
     )
-    found = evaluate_tensors(guidance, truth, grid)
+    found = evaluate_tensors(truth, grid, labels=guidance.labels, points=guidance.points)
     assert found is not None
     assert found.aligned is None
     assert found.before.labels == found.after.labels == (1, 2, 3, 4, 5, 6)
@@ -117,7 +117,7 @@ def test_the_right_map_fits_labels_and_landmarks():
     assert found.before.dice.mean() < 0.9
     assert found.before.hausdorff.mean() > 1
     assert found.before.distances.mean() > 1
-    assert evaluate_tensors(Guidance(), truth, grid) is None
+    assert evaluate_tensors(truth, grid) is None
 
 
 def test_images_are_measured_in_their_place_before_and_after_each_map():
@@ -137,7 +137,7 @@ def test_images_are_measured_in_their_place_before_and_after_each_map():
         fixed_points=points,
         moving_points=ends,
     )
-    found = evaluate_images(fixed, guidance, affine, u)
+    found = evaluate_images(fixed, affine, u, labels=guidance.labels, points=guidance.points)
     assert found is not None
     assert found.aligned is not None
     assert (found.after.dice > 0.97).all()
@@ -152,12 +152,10 @@ def test_labels_of_a_batch_are_carried_item_by_item():
     grid = Grid((30, 34))
     u = torch.cat([bend(grid, 3.0), bend(grid, -1.5)])
     fixed, moving = torch.cat([stripes(grid.shape), stripes(grid.shape).flip(2)]), stripes(grid.shape)
-    together = evaluate_tensors(Guidance(fixed_labels=fixed, moving_labels=moving), u, grid)
+    together = evaluate_tensors(u, grid, labels=(fixed, moving))
     assert together is not None
     for item in range(2):
-        alone = evaluate_tensors(
-            Guidance(fixed_labels=fixed[item : item + 1], moving_labels=moving), u[item : item + 1], grid
-        )
+        alone = evaluate_tensors(u[item : item + 1], grid, labels=(fixed[item : item + 1], moving))
         assert alone is not None
         assert torch.equal(together.after.dice[item], alone.after.dice[0])
 
@@ -167,7 +165,7 @@ def test_the_labels_measured_are_those_that_a_transform_carries():
     place = Image(torch.zeros(1, 1, 30, 34), grid, (5.0, 1.0))
     fixed, moving = replace(place, data=stripes(grid.shape)), replace(place, data=stripes(grid.shape).flip(3))
     affine, u = Affine(torch.eye(2).double() * 1.02, torch.tensor([0.3, -0.4]).double()), bend(grid, 2.0)
-    found = evaluate_images(place, Guidance(fixed_labels=fixed, moving_labels=moving), affine, u)
+    found = evaluate_images(place, affine, u, labels=(fixed, moving))
     assert found is not None
     carried = Transform.from_displacement(u, place, affine=affine).labels(moving, place).data
     assert torch.equal(found.after.dice, dice(fixed.data, carried, found.after.labels))

@@ -8,17 +8,16 @@ import torch
 from pictures import bend, blobs, disc
 from torch import Tensor
 
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image, resample
+from torchdeform.core.intensities import corresponding_channels, fill, to_common_scale
+from torchdeform.core.transform import Affine
+from torchdeform.core.warp import sample, warp
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image, resample
 from torchdeform.registration.deformable import register
-from torchdeform.registration.guidance import Guidance
-from torchdeform.registration.intensities import corresponding_channels, fill, to_common_scale
 from torchdeform.registration.landmarks import spread
-from torchdeform.registration.placing import moved
+from torchdeform.registration.problem import Guidance, moved
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.transform import Affine
-from torchdeform.warp import sample, warp
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 QUICK = RegistrationSettings(steps=(30, 20, 10), weight_div=1.0, length=6.0, window=7, align="none")

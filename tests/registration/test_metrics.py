@@ -11,19 +11,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from torchdeform.core.derivatives import derivative
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.registration.metrics.correlation import LNCC_FLOOR, LocalCrossCorrelation, lncc, ncc
-from torchdeform.registration.metrics.gradients import GradientFields, ngf
-from torchdeform.registration.metrics.information import (
+from torchdeform.metrics.correlation import LNCC_FLOOR, LocalCrossCorrelation, lncc, ncc
+from torchdeform.metrics.gradients import GradientFields, ngf
+from torchdeform.metrics.information import (
     MutualInformation,
     mutual_information,
     normalised_mutual_information,
 )
-from torchdeform.registration.metrics.mind import mind_ssc
-from torchdeform.registration.metrics.squares import mind, ssd
-from torchdeform.registration.similarity import features, make_similarity
-from torchdeform.stencil import derivative
+from torchdeform.metrics.mind import mind_ssc
+from torchdeform.metrics.similarity import features, make_similarity
+from torchdeform.metrics.squares import mind, ssd
 
 SHAPES = [(11, 14), (7, 9, 8)]
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -481,7 +481,7 @@ def test_too_few_bins_and_nodes_are_refused():
 def test_the_adjoint_is_that_of_the_derivative():
     grid = Grid((5, 3, 6), (1.0, 0.4, 2.0))
     x, y = torch.rand(2, 1, 2, *grid.shape, dtype=torch.float64)
-    from torchdeform.stencil import add_adjoint_derivative
+    from torchdeform.core.derivatives import add_adjoint_derivative
 
     for axis in range(3):
         total = torch.zeros_like(y)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchdeform.errors import InputError
-from torchdeform.registration.metrics.mind import mind_ssc, neighbour_pairs
+from torchdeform.metrics.mind import mind_ssc, neighbour_pairs
 
 SHAPES = [(9, 12), (6, 4, 4)]
 

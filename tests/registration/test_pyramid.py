@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchdeform.grid import Grid
-from torchdeform.registration.pyramid import MIN_NODES, prolong, pyramid_grids, restrict
+from torchdeform.core.grid import Grid
+from torchdeform.core.resampling import MIN_NODES, prolong, pyramid_grids, restrict
 
 
 @settings(max_examples=50, deadline=None)

@@ -6,14 +6,14 @@ from dataclasses import asdict, replace
 import pytest
 import torch
 
-from torchdeform.config import load_settings
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import warp
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
+from torchdeform.metrics.mind import mind_ssc
+from torchdeform.metrics.similarity import SIMILARITIES, features, make_similarity, on_one_scale, similarity_weights
+from torchdeform.pipeline.config import load_settings
 from torchdeform.registration.deformable import register
-from torchdeform.registration.metrics.mind import mind_ssc
-from torchdeform.registration.settings import SIMILARITIES, RegistrationSettings, similarity_weights
-from torchdeform.registration.similarity import features, make_similarity, on_one_scale
-from torchdeform.warp import warp
+from torchdeform.registration.settings import RegistrationSettings
 
 SHAPES = [(9, 12), (8, 9, 10)]
 PAIRS = {2: 4, 3: 12}

@@ -8,18 +8,17 @@ import torch
 from pictures import bend, blobs, disc
 from torch import Tensor
 
+from torchdeform.core.fold_free import lowest_determinant, mended
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image, resample
+from torchdeform.core.transform import Affine
+from torchdeform.core.warp import compose, max_voxels, voxels, warp
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image, resample
+from torchdeform.metrics.evaluation import carry_points
 from torchdeform.registration.deformable import register
-from torchdeform.registration.evaluation import carry_points
-from torchdeform.registration.guidance import Guidance
-from torchdeform.registration.placing import moved
+from torchdeform.registration.problem import Guidance, moved
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.registration.steps import lowest_determinant, mended
 from torchdeform.registration.symmetric import common_axes, middle_frame, root
-from torchdeform.transform import Affine
-from torchdeform.warp import compose, max_voxels, voxels, warp
 
 SYMMETRIC = RegistrationSettings(
     steps=(30, 20, 10), step_length=0.5, length=6.0, window=7, symmetric=True, align="none"

@@ -7,11 +7,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchdeform.diagnostics import diagnose
+from torchdeform.core.derivatives import curl, jacobian_determinant
+from torchdeform.core.diagnostics import diagnose
+from torchdeform.core.flow import integrate
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
+from torchdeform.core.transform import Affine, Displacement, Transform
+from torchdeform.core.warp import compose, max_voxels, voxels, warp
 from torchdeform.errors import InputError
-from torchdeform.flow import integrate
-from torchdeform.grid import Grid
-from torchdeform.image import Image
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.template import (
     AveragingSettings,
@@ -22,9 +25,6 @@ from torchdeform.registration.template import (
     identity_map,
     make_template,
 )
-from torchdeform.stencil import curl, jacobian_determinant
-from torchdeform.transform import Affine, Displacement, Transform
-from torchdeform.warp import compose, max_voxels, voxels, warp
 
 GRIDS = [Grid((40, 44), (1.0, 0.9)), Grid((16, 18, 17))]
 STILL = RegistrationSettings(align="none", steps=(40, 15), length=(24.0, 12.0))

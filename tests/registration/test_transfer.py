@@ -7,13 +7,12 @@ import torch
 import torch.nn.functional as F
 from pictures import bend, blobs
 
-from torchdeform.grid import Grid
-from torchdeform.registration import levels
+from torchdeform.core.grid import Grid
+from torchdeform.core.resampling import Transfer, thinned
+from torchdeform.core.warp import warp
+from torchdeform.registration import optimise as levels
 from torchdeform.registration.deformable import register
-from torchdeform.registration.pyramid import thinned
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.registration.transfer import Transfer
-from torchdeform.warp import warp
 
 MODES = {2: "bilinear", 3: "trilinear"}
 

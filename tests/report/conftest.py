@@ -7,13 +7,13 @@ from typing import Any
 import pytest
 import torch
 
-from torchdeform.registration.affine import Alignment
-from torchdeform.registration.evaluation import Evaluation, Measures
+from torchdeform.core.transform import Affine
+from torchdeform.metrics.evaluation import Evaluation, Measures
+from torchdeform.registration.affine.align import Alignment
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.report.command_lines import repeat_command
 from torchdeform.report.record import describe
-from torchdeform.report.scene import Scene, make_scene
-from torchdeform.report.shell import repeat_command
-from torchdeform.transform import Affine
+from torchdeform.report.report_data import Scene, make_scene
 
 SHAPES = {2: (40, 52), 3: (20, 26, 31)}
 NASTY = "<script>alert('x')</script> & \"more\""

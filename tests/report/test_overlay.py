@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from torchdeform.grid import Grid
-from torchdeform.image import Image
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.io import read_image
 from torchdeform.report.drawing import BLUE, ORANGE
-from torchdeform.report.overlay import _cuts, write_overlay
+from torchdeform.report.figures import _cuts, write_overlay
 
 
 def half(dim: int, low: bool, **how) -> Image:

@@ -9,12 +9,12 @@ from html.parser import HTMLParser
 import pytest
 import torch
 
-from torchdeform.grid import Grid
-from torchdeform.image import Image
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.report import make_scene, write_report
 from torchdeform.report.pictures import fitting_pictures
 from torchdeform.report.record import describe, write_json
-from torchdeform.report.sprites import frame_of, sprite
+from torchdeform.report.web_images import frame_of, sprite
 
 FRAMES = {2: 4, 3: 10}
 VOID = {"meta", "link", "br", "img", "input", "hr", "path", "use", "rect"}

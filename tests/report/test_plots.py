@@ -8,12 +8,12 @@ import torch
 from matplotlib.figure import Figure
 
 from torchdeform import report
+from torchdeform.core.derivatives import divergence, jacobian_determinant
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image
 from torchdeform.report import drawing
 from torchdeform.report.planes import planes_of
-from torchdeform.stencil import divergence, jacobian_determinant
 
 SHAPES = [(20, 26), (12, 15, 17)]
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.report.overview import write_overview
+from torchdeform.report.figures import write_overview
 from torchdeform.report.record import describe, write_json
-from torchdeform.report.scene import make_scene
+from torchdeform.report.report_data import make_scene
 
 
 def _pair(make_image, dim, channels=1):

@@ -6,15 +6,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchdeform.diagnostics import inverse_error
+from torchdeform.core.derivatives import curl, divergence, jacobian_determinant
+from torchdeform.core.diagnostics import inverse_error
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image, resample
+from torchdeform.core.transform import Affine
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image, resample
-from torchdeform.registration.placing import moved
+from torchdeform.registration.problem import moved
 from torchdeform.report.planes import PLANES, chosen_plane, planes_of
-from torchdeform.report.scene import grey, make_scene, quantiles, rates, spread, to_unit
-from torchdeform.stencil import curl, divergence, jacobian_determinant
-from torchdeform.transform import Affine
+from torchdeform.report.report_data import grey, make_scene, quantiles, rates, spread, to_unit
 
 
 def test_planes_show_the_patient_upright(make_image):

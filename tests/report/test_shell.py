@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from torchdeform.config import load_settings, parse_override, preset_names
-from torchdeform.memory import parse_size
+from torchdeform.pipeline.config import load_settings, parse_override, preset_names
+from torchdeform.pipeline.memory import parse_size
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.report.shell import apply_commands, changed, repeat_command
+from torchdeform.report.command_lines import apply_commands, changed, repeat_command
 
 FILES = {"fixed": "a b.png", "moving": "it's.png", "out": "$HOME", "fixed_points": "p.csv"}
 
@@ -41,7 +41,7 @@ def test_only_what_differs_is_named():
 
 def test_the_result_can_be_applied():
     """Every line is one of a verb that exists, with options that it has."""
-    from torchdeform.cli import VERBS
+    from torchdeform.cli.main import VERBS
 
     for line in apply_commands(FILES, Path("my results")).values():
         words = shlex.split(line)

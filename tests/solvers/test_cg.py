@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
 from torchdeform.errors import InputError
+from torchdeform.solvers.base import Status
 from torchdeform.solvers.cg import Operator, conjugate_gradient
-from torchdeform.solvers.solution import Status
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
 from torchdeform.errors import InputError
-from torchdeform.solvers import transforms
-from torchdeform.solvers.transforms import KINDS, inverse_transform, separable_transform, transform
+from torchdeform.solvers import sine_cosine as transforms
+from torchdeform.solvers.sine_cosine import KINDS, inverse_transform, separable_transform, transform
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchdeform.core.derivatives import curl, jacobian_determinant
+from torchdeform.core.grid import Grid
 from torchdeform.deformation.prescribed import NewtonSettings, PrescribedSolution, from_jacobian_and_curl
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.stencil import curl, jacobian_determinant
 
 _DEFAULT = NewtonSettings()
 

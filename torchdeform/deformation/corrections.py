@@ -3,13 +3,13 @@
 import torch
 from torch import Tensor
 
+from torchdeform.core.derivatives import determinant, jacobian, map_jacobian
+from torchdeform.core.diagnostics import one_sided_determinant, smallest_determinant
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import warp
 from torchdeform.deformation.velocity import mode_angles, potential_velocity
-from torchdeform.diagnostics import one_sided_determinant, smallest_determinant
 from torchdeform.errors import ComputationError
 from torchdeform.fem.boundary import fixed_unknowns
-from torchdeform.grid import Grid
-from torchdeform.stencil import determinant, jacobian, map_jacobian
-from torchdeform.warp import warp
 
 # A correction that would fold, or miss by more than before, is shortened to these shares of it; then it is left out.
 _SHARES = (1.0, 0.5, 0.25)

@@ -12,10 +12,10 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from torchdeform.core.derivatives import divergence, jacobian
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError, require_choice
-from torchdeform.grid import Grid
-from torchdeform.solvers.transforms import inverse_transform, transform
-from torchdeform.stencil import divergence, jacobian
+from torchdeform.solvers.sine_cosine import inverse_transform, transform
 
 Mean = Literal["mean", "reciprocal_mean"]
 

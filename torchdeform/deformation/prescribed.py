@@ -7,16 +7,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchdeform.deformation.least_squares import Differences, dots
+from torchdeform.core.derivatives import CURL_PAIRS, KERNELS, cofactors, jacobian
+from torchdeform.core.diagnostics import smallest_determinant
+from torchdeform.core.grid import Grid
+from torchdeform.deformation.finite_differences import Differences, dots
 from torchdeform.deformation.monitors import require_positive
-from torchdeform.diagnostics import smallest_determinant
 from torchdeform.errors import InputError, require_choice
 from torchdeform.fem.boundary import fixed_unknowns
 from torchdeform.fem.div_curl import solve_div_curl
-from torchdeform.grid import Grid
+from torchdeform.solvers.base import Solution, Status
 from torchdeform.solvers.cg import DEFAULT_RTOL, conjugate_gradient
-from torchdeform.solvers.solution import Solution, Status
-from torchdeform.stencil import CURL_PAIRS, KERNELS, cofactors, jacobian
 
 # ‖residual‖ ≤ rtol ‖(f − 1, curl)‖ is asked for when nothing else is said.
 _RTOL = {torch.float32: 1e-5, torch.float64: 1e-12}

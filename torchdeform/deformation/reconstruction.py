@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchdeform.deformation.least_squares import Differences
+from torchdeform.core.derivatives import CURL_PAIRS, KERNELS
+from torchdeform.core.grid import Grid
+from torchdeform.deformation.finite_differences import Differences
 from torchdeform.errors import InputError, require_choice
 from torchdeform.fem.div_curl import DivCurlSolution, solve_div_curl
-from torchdeform.grid import Grid
+from torchdeform.solvers.base import Solution
 from torchdeform.solvers.cg import conjugate_gradient
-from torchdeform.solvers.solution import Solution
-from torchdeform.stencil import CURL_PAIRS, KERNELS
 
 
 @dataclass(frozen=True)

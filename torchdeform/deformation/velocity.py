@@ -7,11 +7,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchdeform.core.grid import Grid
 from torchdeform.deformation.monitors import mean_value
 from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.fem import solve_div_curl
-from torchdeform.grid import Grid
-from torchdeform.solvers.transforms import Kinds, inverse_transform, separable_transform
+from torchdeform.solvers.sine_cosine import Kinds, inverse_transform, separable_transform
 
 VelocityName = Literal["direct", "poisson", "div_curl"]
 

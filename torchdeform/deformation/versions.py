@@ -18,14 +18,14 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from torchdeform.core.flow import OdeSolver, integrate_points
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import max_voxels, sample
 from torchdeform.deformation.corrections import correct_determinant, remove_folds
 from torchdeform.deformation.monitors import mean_value, normalise_monitor, require_positive
 from torchdeform.deformation.velocity import VelocityName, find_velocity
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.fem.boundary import fixed_unknowns
-from torchdeform.flow import OdeSolver, integrate_points
-from torchdeform.grid import Grid
-from torchdeform.warp import max_voxels, sample
 
 # A monitor in time: t -> f (B, 1, *S), or its values at the times asked for, (T, B, 1, *S).
 MovingMonitor = Callable[[float], Tensor] | Tensor | Sequence[Tensor]

@@ -8,22 +8,22 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from torchdeform.deformation.least_squares import dots
+from torchdeform.core.derivatives import determinant
+from torchdeform.core.diagnostics import smallest_determinant
+from torchdeform.core.flow import OdeSolver, integrate_points
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import sample
+from torchdeform.deformation.finite_differences import dots
 from torchdeform.deformation.monitors import mean_value, smooth
 from torchdeform.deformation.versions import grid_from_initial_monitor
-from torchdeform.diagnostics import smallest_determinant
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.fem.boundary import constrain, fixed_unknowns
+from torchdeform.fem.fast_transform import TransformSolver
 from torchdeform.fem.form import div_curl_form
 from torchdeform.fem.operator import apply_form, assemble_load
-from torchdeform.fem.spectral import TransformSolver
 from torchdeform.fem.weights import Weights
-from torchdeform.flow import OdeSolver, integrate_points
-from torchdeform.grid import Grid
+from torchdeform.solvers.base import Solution, Status
 from torchdeform.solvers.cg import conjugate_gradient
-from torchdeform.solvers.solution import Solution, Status
-from torchdeform.stencil import determinant
-from torchdeform.warp import sample
 
 # Next to what must not move no velocity has both the divergence and the curl that are asked for: volumes come first.
 _AROUND_RIGID = Weights(div=10.0, curl=1.0)

@@ -6,10 +6,10 @@ import warnings
 import torch
 from torch import Tensor
 
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.fem.elements import components, element_matrices
 from torchdeform.fem.form import Form
-from torchdeform.grid import Grid
 
 
 def assemble(form: Form, grid: Grid, device: torch.device | str = "cpu") -> Tensor:

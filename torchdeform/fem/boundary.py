@@ -6,8 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError, require_choice
-from torchdeform.grid import Grid
 
 
 class Face(NamedTuple):

@@ -8,16 +8,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdeform.core.derivatives import CURL_PAIRS
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError, require_choice
 from torchdeform.fem.boundary import Boundary, constrain, fixed_unknowns, lift, normal_is_given, outward_flux
+from torchdeform.fem.fast_transform import TransformSolver, solve_poisson, transform_is_exact
 from torchdeform.fem.form import div_curl_form, gradient_form
 from torchdeform.fem.operator import apply_form, assemble_load, form_diagonal
-from torchdeform.fem.spectral import TransformSolver, solve_poisson, transform_is_exact
 from torchdeform.fem.weights import Weights
-from torchdeform.grid import Grid
+from torchdeform.solvers.base import Solution, Status
 from torchdeform.solvers.cg import DEFAULT_RTOL, Operator, conjugate_gradient
-from torchdeform.solvers.solution import Solution, Status
-from torchdeform.stencil import CURL_PAIRS
 
 SolverName = Literal["auto", "transform", "cg"]
 PreconditionerName = Literal["transform", "jacobi", "none"]

@@ -9,8 +9,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from torchdeform.core.grid import Grid
 from torchdeform.fem.form import Coefficient, Form, Row
-from torchdeform.grid import Grid
 
 # With N_0 = 1 − x, N_1 = x on an interval of length h: whether the test and the trial function are differentiated
 # -> (the matrix for h = 1, the power of h it takes). Row = test function, column = trial function.

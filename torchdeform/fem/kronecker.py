@@ -11,8 +11,8 @@ from functools import lru_cache
 from torch import Tensor
 from torch.autograd import Function
 
+from torchdeform.core.grid import Grid
 from torchdeform.fem.elements import INTERVAL, Matrix
-from torchdeform.grid import Grid
 
 # Per axis: is the test function differentiated, is the trial function?
 Factor = tuple[bool, bool]

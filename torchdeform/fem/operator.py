@@ -6,11 +6,11 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from torchdeform.core.grid import Grid
 from torchdeform.fem.elements import at_corners, components, gauss_weight, row_table
 from torchdeform.fem.form import Coefficient, Form, Row
 from torchdeform.fem.kronecker import Product, apply_products
 from torchdeform.fem.quadrature import apply_by_quadrature, load_by_quadrature, scatter
-from torchdeform.grid import Grid
 
 
 def apply_form(form: Form, v: Tensor, grid: Grid) -> Tensor:

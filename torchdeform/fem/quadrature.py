@@ -8,9 +8,9 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from torchdeform.core.grid import Grid
 from torchdeform.fem.elements import components, gauss_table, gauss_weight
 from torchdeform.fem.form import Coefficient, Form, map_coefficients
-from torchdeform.grid import Grid
 
 # Elements worked on at once: on a CPU what is known of them (some 8 MB) stays near, elsewhere few launches matter.
 _SLAB, _LARGE_SLAB = 1 << 15, 1 << 20

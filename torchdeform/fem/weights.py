@@ -5,8 +5,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
 
 Weight = float | Tensor
 

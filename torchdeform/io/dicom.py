@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.image import Image
 from torchdeform.io import itk
-from torchdeform.io.complaints import BROKEN_OFF
 from torchdeform.io.files import beginning
+from torchdeform.io.validation import BROKEN_OFF
 
 if TYPE_CHECKING:
     import SimpleITK as sitk

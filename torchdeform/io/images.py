@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image
 from torchdeform.io import dicom, itk
-from torchdeform.io.complaints import BROKEN_OFF, NOT_SQUARE, other_kind, require_sound
 from torchdeform.io.files import staged, suffix
 from torchdeform.io.tiff import read_tiff, write_tiff
+from torchdeform.io.validation import BROKEN_OFF, NOT_SQUARE, other_kind, require_sound
 
 
 @dataclass(frozen=True)
@@ -201,3 +201,31 @@ def ending_like(path: Path, image: Image) -> str:
     ending = suffix(path)
     endings = (ending, ".png") if ending in _PLAIN_PICTURES else (ending,)
     return next((e for e in endings if can_hold(e, image)), ".nii.gz")
+
+
+def image_size(path: Path) -> tuple[tuple[int, ...], int] | None:
+    """Return the shape (z, y, x; axes of one sample dropped) and the channels of an image file, None if unknown.
+
+    Args:
+        path: a file, or a folder of DICOM slices, all of which are taken for one series.
+
+    Notes:
+        Reads no pixels, so a file may turn out damaged later. What ITK does not know is unknown here.
+    """
+    import SimpleITK as sitk
+
+    files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+    reader = sitk.ImageFileReader()
+
+    def look() -> tuple[tuple[int, ...], int]:
+        reader.SetFileName(str(files[0]))
+        reader.ReadImageInformation()
+        return reader.GetSize(), reader.GetNumberOfComponents()
+
+    found = itk.quietly(look) if files else None
+    if found is None or isinstance(found, RuntimeError):
+        return None
+    size, channels = found
+    slices = (len(files),) if len(files) > 1 else ()
+    shape = tuple(n for n in (*slices, *size[::-1]) if n > 1)
+    return (shape, channels) if len(shape) in (2, 3) else None

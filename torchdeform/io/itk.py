@@ -10,11 +10,11 @@ import torch
 from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
+from torchdeform.core.grid import Grid, slabs
+from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid, slabs
-from torchdeform.image import Image
-from torchdeform.io.complaints import BROKEN_OFF, NOT_SQUARE
 from torchdeform.io.files import native_stderr
+from torchdeform.io.validation import BROKEN_OFF, NOT_SQUARE
 
 if TYPE_CHECKING:
     import SimpleITK as sitk

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.image import Image
 from torchdeform.io import itk
 from torchdeform.io.files import staged, suffix
 from torchdeform.io.images import FORMATS, read_image, write_image

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchdeform.image import Image
+from torchdeform.core.image import Image
 from torchdeform.io import itk
 from torchdeform.io.files import staged
 

@@ -12,10 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.image import Image
-from torchdeform.io.complaints import require_sound
 from torchdeform.io.files import staged, suffix
+from torchdeform.io.validation import require_sound
 
 _WORLD, _VOXEL = ("x", "y", "z"), ("i", "j", "k")
 _NAMES = ("name", "label", "landmark", "id", "index", "")

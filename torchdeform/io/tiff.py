@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image
 from torchdeform.io import itk
-from torchdeform.io.complaints import BROKEN_OFF
+from torchdeform.io.validation import BROKEN_OFF
 
 if TYPE_CHECKING:
     from tifffile import TiffFile

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchdeform.core.image import Image
+from torchdeform.core.transform import Affine, Displacement, Stage, Transform
 from torchdeform.errors import InputError
-from torchdeform.image import Image
 from torchdeform.io import itk
-from torchdeform.io.complaints import require_sound
 from torchdeform.io.files import native_stderr, staged, suffix
-from torchdeform.transform import Affine, Displacement, Stage, Transform
+from torchdeform.io.validation import require_sound
 
 if TYPE_CHECKING:
     import SimpleITK as sitk

@@ -11,7 +11,7 @@ from torchdeform.nn.losses import (
     InverseConsistencyLoss,
     SimilarityLoss,
 )
-from torchdeform.nn.optimiser import DeformableRegistration
+from torchdeform.nn.registration import DeformableRegistration
 from torchdeform.nn.spatial import SpatialTransformer
 from torchdeform.nn.velocity import DivCurlVelocity, FlowIntegrator
 

@@ -7,15 +7,14 @@ from functools import cached_property
 import torch
 from torch import Tensor, nn
 
+from torchdeform.core.derivatives import CURL_PAIRS
+from torchdeform.core.grid import Grid, per_item
+from torchdeform.core.resampling import prolong
+from torchdeform.core.warp import invert
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
 from torchdeform.nn.heads import draw_back, flow_to_monitor, with_mean_one
 from torchdeform.nn.precision import full_precision
 from torchdeform.nn.spatial import SpatialTransformer
-from torchdeform.registration.metrics.base import column
-from torchdeform.registration.pyramid import prolong
-from torchdeform.stencil import CURL_PAIRS
-from torchdeform.warp import invert
 
 # Nodes of the grid on which the map is found, per node of the noise: the flow is smooth between the random numbers.
 _REFINEMENT = 4
@@ -140,7 +139,7 @@ class RandomDeformation(nn.Module):
         longest = max(self.grid.extent)
         shape = [max(2, round(self.nodes * side / longest)) for side in self.grid.extent]
         noise = 2 * torch.rand(items, 1 + len(CURL_PAIRS[self.grid.dim]), *shape, generator=generator) - 1
-        return noise * column(torch.rand(items, generator=generator) < self.probability, noise)
+        return noise * per_item(torch.rand(items, generator=generator) < self.probability, noise)
 
     @full_precision
     def _maps(self, noise: Tensor) -> Tensor:
@@ -151,7 +150,7 @@ class RandomDeformation(nn.Module):
         falling = noise[:, :1].clamp(max=0) * -math.log(low)
         f = with_mean_one(torch.exp(rising + falling), grid)
         u = flow_to_monitor(f, self.curl * noise[:, 1:], grid, _STEPS)
-        u = u * column((noise != 0).flatten(1).any(1), u)
+        u = u * per_item((noise != 0).flatten(1).any(1), u)
         # Most of what must be drawn back is where that costs little; the second look rarely finds anything.
         u = draw_back(u, grid, low**_MARGIN, high**_MARGIN, _MARGIN * self.curl)
         return draw_back(prolong(u, self.grid), self.grid, low, high, self.curl)

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
 
 
 def to_voxels(u: Tensor, grid: Grid) -> Tensor:

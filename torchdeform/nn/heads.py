@@ -5,14 +5,13 @@ import math
 import torch
 from torch import Tensor, nn
 
+from torchdeform.core.derivatives import CURL_PAIRS
+from torchdeform.core.grid import Grid, per_item
+from torchdeform.core.resampling import prolong
+from torchdeform.core.warp import warp
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
 from torchdeform.nn.operators import div_curl_velocity, open_share
 from torchdeform.nn.precision import full_precision
-from torchdeform.registration.metrics.base import column
-from torchdeform.registration.pyramid import prolong
-from torchdeform.stencil import CURL_PAIRS
-from torchdeform.warp import warp
 
 _CONV = {2: nn.Conv2d, 3: nn.Conv3d}
 
@@ -129,13 +128,13 @@ def draw_back(u: Tensor, grid: Grid, least: float, most: float = math.inf, turn:
     with torch.no_grad():
         still, floor = torch.zeros_like(u), u.new_full((u.shape[0],), least)
         share = open_share(still, u.detach(), floor, grid.spacing, most, turn)
-    return u * column(share, u)
+    return u * per_item(share, u)
 
 
 def with_mean_one(f: Tensor, grid: Grid) -> Tensor:
     """Return f ``(B, 1, *S)`` divided by its mean over Ω, as `normalise_monitor`, but without looking at the values."""
     weights = grid.quadrature(dtype=f.dtype, device=f.device) / grid.volume
-    return f / column((f * weights).flatten(1).sum(1), f)
+    return f / per_item((f * weights).flatten(1).sum(1), f)
 
 
 def flow_to_monitor(f: Tensor, curl: Tensor, grid: Grid, steps: int) -> Tensor:

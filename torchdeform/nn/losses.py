@@ -5,15 +5,15 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from torchdeform.core.derivatives import curl, divergence, jacobian_determinant
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import compose
 from torchdeform.errors import InputError, require_choice
-from torchdeform.grid import Grid
+from torchdeform.metrics.correlation import lncc, ncc
+from torchdeform.metrics.gradients import ngf
+from torchdeform.metrics.information import mutual_information, normalised_mutual_information
+from torchdeform.metrics.squares import mind, ssd
 from torchdeform.nn.precision import full_precision
-from torchdeform.registration.metrics.correlation import lncc, ncc
-from torchdeform.registration.metrics.gradients import ngf
-from torchdeform.registration.metrics.information import mutual_information, normalised_mutual_information
-from torchdeform.registration.metrics.squares import mind, ssd
-from torchdeform.stencil import curl, divergence, jacobian_determinant
-from torchdeform.warp import compose
 
 # name -> the similarity S(fixed, warped, mask=...) -> (B,), higher is better.
 SIMILARITIES: dict[str, Callable[..., Tensor]] = {

@@ -11,14 +11,13 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchdeform.diagnostics import smallest_determinant
+from torchdeform.core.derivatives import curl, jacobian_determinant
+from torchdeform.core.diagnostics import smallest_determinant
+from torchdeform.core.grid import Grid, per_item
+from torchdeform.fem.fast_transform import TransformSolver
 from torchdeform.fem.form import Form, div_curl_form
 from torchdeform.fem.operator import assemble_load
-from torchdeform.fem.spectral import TransformSolver
 from torchdeform.fem.weights import Weights
-from torchdeform.grid import Grid
-from torchdeform.registration.metrics.base import column
-from torchdeform.stencil import curl, jacobian_determinant
 
 # A map that must be drawn back is drawn back to a multiple of one part in 2 to this power.
 _HALVINGS = 7
@@ -127,7 +126,7 @@ def open_share(
     low = torch.zeros_like(least)
     for k in range(1, _HALVINGS + 1 if len(index) else 0):
         trial = low + 0.5**k
-        low = torch.where(_within(start + column(trial, move) * move, grid, least, most, turn), trial, low)
+        low = torch.where(_within(start + per_item(trial, move) * move, grid, least, most, turn), trial, low)
     share[index] = low
     return share
 

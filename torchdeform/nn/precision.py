@@ -7,7 +7,7 @@ from typing import ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from torchdeform.registration.metrics.base import at_least_float32
+from torchdeform.metrics.base import at_least_float32
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")

@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor, nn
 
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import sample, warp
 from torchdeform.errors import InputError, require_choice
-from torchdeform.grid import Grid
 from torchdeform.nn.precision import full_precision
-from torchdeform.warp import sample, warp
 
 
 class SpatialTransformer(nn.Module):

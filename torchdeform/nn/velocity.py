@@ -3,15 +3,15 @@
 import torch
 from torch import Tensor, nn
 
+from torchdeform.core.derivatives import CURL_PAIRS
+from torchdeform.core.flow import ADAPTIVE, FIXED_STEP, OdeSolver, integrate
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import compose, keep_inside
 from torchdeform.errors import InputError, require_choice
-from torchdeform.fem.spectral import transform_is_exact
+from torchdeform.fem.fast_transform import transform_is_exact
 from torchdeform.fem.weights import Weights
-from torchdeform.flow import ADAPTIVE, FIXED_STEP, OdeSolver, integrate
-from torchdeform.grid import Grid
 from torchdeform.nn.operators import div_curl_velocity
 from torchdeform.nn.precision import full_precision
-from torchdeform.stencil import CURL_PAIRS
-from torchdeform.warp import compose, keep_inside
 
 _BOUNDARIES = ("slip", "no_slip_tangential", "dirichlet")
 

@@ -6,20 +6,20 @@ from time import perf_counter
 import torch
 from torch import Tensor
 
-from torchdeform.diagnostics import Diagnosis, diagnose, inverse_error, smallest_determinant
+from torchdeform.core.diagnostics import Diagnosis, diagnose, inverse_error, smallest_determinant
+from torchdeform.core.fold_free import mended
+from torchdeform.core.grid import Grid, threads_worth
+from torchdeform.core.image import Image, resample
+from torchdeform.core.resampling import MIN_NODES, prolong
+from torchdeform.core.transform import Affine
+from torchdeform.core.warp import invert, warp
 from torchdeform.errors import ComputationError, InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image, resample
-from torchdeform.registration.affine import Alignment, align
-from torchdeform.registration.comparison import compare_from_fixed
+from torchdeform.metrics.evaluation import evaluate_images, evaluate_tensors
+from torchdeform.registration.affine.align import Alignment, align
 from torchdeform.registration.discrete import discrete_start
-from torchdeform.registration.evaluation import evaluate_images, evaluate_tensors
-from torchdeform.registration.guidance import Guidance
-from torchdeform.registration.levels import climb_levels
-from torchdeform.registration.placing import Subject, moved, place, subjects
-from torchdeform.registration.pyramid import MIN_NODES
+from torchdeform.registration.optimise import climb_levels, compare_from_fixed
+from torchdeform.registration.problem import Guidance, Scene, Subject, moved, place, subjects, tensor_scene
 from torchdeform.registration.result import Callback, LevelRecord, RegistrationResult
-from torchdeform.registration.scene import Scene, tensor_scene
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.symmetric import (
     Middle,
@@ -28,9 +28,6 @@ from torchdeform.registration.symmetric import (
     climb_from_middle,
     common_axes,
 )
-from torchdeform.registration.threads import threads_worth
-from torchdeform.transform import Affine
-from torchdeform.warp import invert, warp
 
 
 @torch.no_grad()
@@ -99,7 +96,8 @@ def _register_tensors(
     climbed = _climb(scene, between_tensors(scene) if settings.symmetric else None, settings, start, callback)
     del scene
     with threads_worth(len(climbed.u), grid):
-        warped, evaluation = warp(moving, climbed.u, grid), evaluate_tensors(guidance, climbed.u, grid)
+        warped = warp(moving, climbed.u, grid)
+        evaluation = evaluate_tensors(climbed.u, grid, labels=guidance.labels, points=guidance.points)
     return replace(_finish(climbed, grid, warped, settings), evaluation=evaluation)
 
 
@@ -149,7 +147,7 @@ def _register_images(
         result,
         affine=affine,
         alignment=alignment,
-        evaluation=evaluate_images(fixed, guidance, affine, climbed.u),
+        evaluation=evaluate_images(fixed, affine, climbed.u, labels=guidance.labels, points=guidance.points),
         seconds=({"align": alignment.seconds} if alignment else {}) | result.seconds,
     )
 
@@ -263,3 +261,34 @@ def _require_sound(u: Tensor, grid: Grid) -> Diagnosis:
             "register: the map is not finite; check the images for extreme values, or lower step_length"
         )
     return diagnose(u, grid)
+
+
+@torch.no_grad()
+def onto_grid(result: RegistrationResult, fixed: Image, moving: Image, guidance: Guidance) -> RegistrationResult:
+    """Return the result on the grid of ``fixed``, everything that follows from its maps made anew.
+
+    Args:
+        result: of images, on a coarser grid of the same box.
+        fixed: the fixed image, whose grid is wanted.
+        moving: the moving image.
+        guidance: labels and landmarks to measure.
+
+    Returns:
+        The result with both maps interpolated linearly, which keeps them fold-free or mends them; similarities are
+        those of the grid on which it was found.
+    """
+    grid = fixed.grid
+    u, inverse = (mended(prolong(w, grid), grid) for w in (result.displacement, result.inverse))
+    mean, largest = inverse_error(u, inverse, grid)
+    seen = moving if result.affine is None else moved(moving, result.affine.inverse())
+    return replace(
+        result,
+        displacement=u,
+        inverse=inverse,
+        grid=grid,
+        warped=resample(seen, fixed, u).to(moving.data.dtype),
+        diagnosis=diagnose(u, grid),
+        inverse_error_mean=mean,
+        inverse_error_max=largest,
+        evaluation=evaluate_images(fixed, result.affine, u, labels=guidance.labels, points=guidance.points),
+    )

@@ -7,18 +7,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdeform.core.flow import integrate
+from torchdeform.core.fold_free import mended
+from torchdeform.core.grid import Grid
+from torchdeform.core.resampling import MIN_NODES, prolong, pyramid_grids, restrict
+from torchdeform.core.warp import compose, warp
 from torchdeform.errors import InputError
+from torchdeform.fem.fast_transform import TransformSolver
 from torchdeform.fem.form import Row, Term
 from torchdeform.fem.operator import assemble_load
-from torchdeform.fem.spectral import TransformSolver
 from torchdeform.fem.weights import Weights
-from torchdeform.flow import integrate
-from torchdeform.grid import Grid
-from torchdeform.registration.metrics.mind import mind_ssc
-from torchdeform.registration.pyramid import MIN_NODES, prolong, pyramid_grids, restrict
-from torchdeform.registration.steps import mended
-from torchdeform.solvers.transforms import inverse_transform, transform
-from torchdeform.warp import compose, warp
+from torchdeform.metrics.mind import mind_ssc
+from torchdeform.solvers.sine_cosine import inverse_transform, transform
 
 # Rounds in which the two directions are made inverse to each other, and in which a velocity is fitted to matches.
 _ROUNDS = 15

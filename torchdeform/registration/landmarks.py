@@ -8,8 +8,8 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from torchdeform.grid import Grid
-from torchdeform.warp import sample
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import sample
 
 # Newton's steps that bring the middle points to where they belong, at first and after every step of the maps.
 _FIRST, _AGAIN = 30, 3

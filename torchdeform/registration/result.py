@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchdeform.diagnostics import Diagnosis
-from torchdeform.grid import Grid
-from torchdeform.registration.affine import Alignment
-from torchdeform.registration.evaluation import Evaluation
+from torchdeform.core.diagnostics import Diagnosis
+from torchdeform.core.grid import Grid
+from torchdeform.core.transform import Affine
+from torchdeform.metrics.evaluation import Evaluation
+from torchdeform.registration.affine.align import Alignment
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.transform import Affine
 
 
 @dataclass(frozen=True)

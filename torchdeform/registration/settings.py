@@ -3,32 +3,12 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from numbers import Real
 
 from torchdeform.errors import InputError, require_choice
+from torchdeform.metrics.similarity import similarity_weights
 
-SIMILARITIES = ("ssd", "ncc", "lncc", "mi", "nmi", "ngf", "mind")
 ALIGNMENTS = ("none", "translation", "rigid", "similarity", "affine")
 STARTS = ("identity", "discrete")
-
-
-def similarity_weights(similarity: str | Mapping[str, float]) -> dict[str, float]:
-    """Return the measures that a setting ``similarity`` names, with their weights.
-
-    Args:
-        similarity: a name of `SIMILARITIES`, which has weight 1, or names with their weights.
-
-    Raises:
-        InputError: no name, an unknown one, or a weight that is not positive and finite.
-    """
-    if not isinstance(similarity, str | Mapping) or not similarity:
-        raise InputError(f"similarity must name one of {', '.join(SIMILARITIES)}, or several with their weights")
-    weights = {similarity: 1.0} if isinstance(similarity, str) else dict(similarity)
-    for name, weight in weights.items():
-        require_choice(name, SIMILARITIES, "similarity")
-        if isinstance(weight, bool) or not isinstance(weight, Real) or not 0 < weight < math.inf:
-            raise InputError(f"similarity: the weight of {name} must be a positive finite number, got {weight!r}")
-    return weights
 
 
 @dataclass(frozen=True, kw_only=True)

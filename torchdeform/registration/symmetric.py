@@ -6,18 +6,17 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchdeform.core.fold_free import mended
+from torchdeform.core.grid import Grid, over_slabs
+from torchdeform.core.image import Image
+from torchdeform.core.resampling import MIN_NODES
+from torchdeform.core.transform import Affine
+from torchdeform.core.warp import compose, invert, sample
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid, over_slabs
-from torchdeform.image import Image
-from torchdeform.registration.levels import climb_levels
-from torchdeform.registration.placing import Subject, place
-from torchdeform.registration.pyramid import MIN_NODES
+from torchdeform.registration.optimise import climb_levels
+from torchdeform.registration.problem import Scene, Subject, place
 from torchdeform.registration.result import Callback, LevelRecord
-from torchdeform.registration.scene import Scene
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.registration.steps import mended
-from torchdeform.transform import Affine
-from torchdeform.warp import compose, invert, sample
 
 Direction = tuple[tuple[float, ...], ...]
 

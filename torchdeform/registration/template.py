@@ -8,15 +8,15 @@ from typing import Literal, TypeVar, get_args, overload
 import torch
 from torch import Tensor
 
+from torchdeform.core.diagnostics import smallest_determinant
+from torchdeform.core.image import Image
+from torchdeform.core.transform import Affine, Displacement, Transform, place_of
+from torchdeform.core.warp import compose, invert, max_voxels
 from torchdeform.deformation.averages import average_maps
-from torchdeform.diagnostics import smallest_determinant
 from torchdeform.errors import ComputationError, InputError, require_choice
-from torchdeform.image import Image
 from torchdeform.registration.deformable import register
 from torchdeform.registration.result import Callback
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.transform import Affine, Displacement, Transform, place_of
-from torchdeform.warp import compose, invert, max_voxels
 
 T = TypeVar("T")
 Pose = Literal["reference", "mean"]

@@ -14,7 +14,7 @@ from torchdeform.report.plots import (
     plot_overlay,
     plot_volume_histogram,
 )
-from torchdeform.report.scene import Scene, make_scene
+from torchdeform.report.report_data import Scene, make_scene
 
 __all__ = [
     "Scene",

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchdeform.metrics.similarity import similarity_weights
 from torchdeform.registration.result import RegistrationResult
-from torchdeform.registration.settings import similarity_weights
 from torchdeform.report.planes import Plane
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchdeform.report.pictures import fitting_pictures
 from torchdeform.report.record import describe
-from torchdeform.report.scene import Scene
+from torchdeform.report.report_data import Scene
 from torchdeform.report.tables import command_lines, file_name, footer, tables, tiles
 from torchdeform.report.verdict import BAD, DOUBTFUL, GOOD, judge
 

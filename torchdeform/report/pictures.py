@@ -15,8 +15,8 @@ from torchdeform.report.drawing import (
     signed_scale,
     volume_scale,
 )
-from torchdeform.report.scene import Scene, Slices
-from torchdeform.report.sprites import UNITS, Frame, colours, curve, frame_of, grey_levels, grid_paths, sprite, stops
+from torchdeform.report.report_data import Scene, Slices
+from torchdeform.report.web_images import UNITS, Frame, colours, curve, frame_of, grey_levels, grid_paths, sprite, stops
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,9 +7,9 @@ from itertools import permutations
 import torch
 from torch import Tensor
 
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.errors import InputError, require_choice
-from torchdeform.grid import Grid
-from torchdeform.image import Image
 
 PLANES = ("axial", "coronal", "sagittal")
 

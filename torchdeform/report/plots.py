@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchdeform.core.derivatives import curl, divergence, jacobian_determinant
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
+from torchdeform.core.warp import compose, voxels
 from torchdeform.errors import InputError
-from torchdeform.grid import Grid
-from torchdeform.image import Image
 from torchdeform.registration.result import RegistrationResult
 from torchdeform.report import drawing
 from torchdeform.report.planes import Plane, chosen_plane
-from torchdeform.report.scene import end_of_scale, grey, log_volume, seen, to_unit, volume_counts
-from torchdeform.stencil import curl, divergence, jacobian_determinant
-from torchdeform.warp import compose, voxels
+from torchdeform.report.report_data import end_of_scale, grey, log_volume, seen, to_unit, volume_counts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

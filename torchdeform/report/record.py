@@ -11,8 +11,8 @@ from typing import Any
 import torch
 
 from torchdeform import __version__
-from torchdeform.image import Image
-from torchdeform.registration.evaluation import Evaluation, Measures
+from torchdeform.core.image import Image
+from torchdeform.metrics.evaluation import Evaluation, Measures
 from torchdeform.registration.result import LevelRecord, RegistrationResult
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchdeform.registration.settings import similarity_weights
-from torchdeform.report.shell import apply_commands
+from torchdeform.metrics.similarity import similarity_weights
+from torchdeform.report.command_lines import apply_commands
 from torchdeform.report.verdict import ends, number, value
 
 _LONG = 12  # rows that are shown without asking

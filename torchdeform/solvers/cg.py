@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from torchdeform.errors import InputError
-from torchdeform.solvers.solution import Solution, Status
+from torchdeform.solvers.base import Solution, Status
 
 # ‖r‖ ≤ rtol ‖b‖ is asked for when nothing else is said.
 DEFAULT_RTOL = {torch.float32: 1e-5, torch.float64: 1e-10}

@@ -1,1 +1,0 @@
-"""Templates: the mean shape and intensity of many images."""

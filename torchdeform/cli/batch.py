@@ -1,0 +1,136 @@
+"""``batch`` and ``schema``: many pairs from one file."""
+
+import json
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from torchdeform.cli.options import Quiet, table
+from torchdeform.cli.progress import CohortProgress
+from torchdeform.cohort.estimate import Costs, estimate
+from torchdeform.cohort.plan import DESCRIPTION, Plan, description, plan
+from torchdeform.cohort.run import review, run
+from torchdeform.cohort.schema import cohort_schema, read_cohort
+from torchdeform.cohort.settings import EngineSettings
+from torchdeform.cohort.summary import FAILURES, PAGE, Summary
+from torchdeform.io.files import staged
+from torchdeform.pipeline.memory import readable
+from torchdeform.report.record import write_json
+
+STOPPED = 130  # exit code of a shell's command that Ctrl-C ended
+
+CohortFile = Annotated[Path, typer.Argument(metavar="COHORT.yaml", help="What to register, and how.")]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", metavar="", help="Show the pairs, what is missing, and what it takes; run nothing.")
+]
+PrintConfig = Annotated[
+    bool, typer.Option("--print-config", metavar="", help="Print the file with everything filled in; run nothing.")
+]
+Only = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="Only the pairs called so, or so and more (sub-01), or like sub-0*; repeatable."),
+]
+Resume = Annotated[
+    bool, typer.Option("--resume/--no-resume", help="Leave alone what is done with the same files and settings.")
+]
+RetryFailed = Annotated[bool, typer.Option("--retry-failed", metavar="", help="Run again what failed before.")]
+SchemaOut = Annotated[
+    Path | None, typer.Option("--out", metavar="FILE.json", show_default="standard output", help="Where to write it.")
+]
+
+
+def batch(
+    cohort_file: CohortFile,
+    dry_run: DryRun = False,
+    print_config: PrintConfig = False,
+    only: Only = None,
+    resume: Resume = True,
+    retry_failed: RetryFailed = False,
+    quiet: Quiet = False,
+) -> None:
+    """Register all pairs of a cohort: each MOVING is warped onto its FIXED, as register does it.
+
+    What is done stays done: the same command goes on where a run ended, and does again what has changed since.
+    The file is described in docs/cohorts.md; torchdeform schema helps editors to complete and check it.
+    """
+    cohort = read_cohort(cohort_file)
+    if print_config:
+        typer.echo(cohort.to_yaml(), nl=False)
+        return
+    whole = plan(cohort)
+    work = whole.only(only) if only else whole
+    if dry_run:
+        typer.echo(overview(work, estimate(work.jobs)))
+        return
+    how = {"resume": resume, "retry_failed": retry_failed}
+    with interrupted_by_termination(), CohortProgress(quiet) as progress:
+        summary = _run(work, whole, cohort.engine, progress, how)
+    if not quiet:
+        typer.echo(outcome(summary))
+    if summary.failed:
+        raise typer.Exit(1)
+
+
+def _run(work: Plan, whole: Plan, engine: EngineSettings, progress: CohortProgress, how: dict[str, bool]) -> Summary:
+    """Run a plan, a part of the whole cohort, and write the summary of the whole."""
+    try:
+        summary = run(work.jobs, work.out, engine, problems=work.problems, report=progress.show, **how)
+        write_json(description(), work.out / DESCRIPTION)
+        return summary
+    except KeyboardInterrupt:
+        typer.echo("batch: stopped; what is done is kept, run the same command again to go on", err=True)
+        raise typer.Exit(STOPPED) from None
+    finally:
+        if work is not whole:
+            review(whole.jobs, whole.out, whole.problems)
+
+
+@contextmanager
+def interrupted_by_termination() -> Iterator[None]:
+    """Let the signal by which queues end a job stop the run as Ctrl-C does."""
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    former = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, former)
+
+
+def outcome(summary: Summary) -> str:
+    """Return what became of a cohort, in a few lines."""
+    lines = {"pairs": f"{summary.done} done, {summary.failed} failed"}
+    if summary.failed:
+        lines["failures"] = str(summary.out / FAILURES)
+    return table(lines | {"results": str(summary.out / PAGE)})
+
+
+def schema(out: SchemaOut = None) -> None:
+    """Print the JSON Schema of a cohort file, with which editors complete and check it while one types."""
+    text = json.dumps(cohort_schema(), indent=2) + "\n"
+    if out is None:
+        typer.echo(text, nl=False)
+        return
+    with staged(out.parent) as folder:
+        (folder / out.name).write_text(text, encoding="utf-8")
+
+
+def overview(work: Plan, costs: Costs) -> str:
+    """Return the pairs of a plan, those that cannot run, and what it takes, as lines to read."""
+    pairs = [f"{job.name}: {job.files.moving} -> {job.files.fixed}" for job in work.jobs]
+    problems = [f"cannot run: {problem.name}: {problem.sentence}" for problem in work.problems]
+    sums = {
+        "pairs": f"{len(work.jobs)} to register, {len(work.problems)} cannot run",
+        "time": f"about {costs.readable_time} one after another, on one core",
+        "memory": f"about {readable(costs.memory)} for the largest pair",
+        "results": str(work.out),
+    }
+    if costs.unknown:
+        sums["unknown"] = f"{costs.unknown} pairs whose size cannot be told before they run, not counted"
+    return "\n".join([*pairs, *problems, table(sums)])

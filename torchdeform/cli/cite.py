@@ -1,0 +1,51 @@
+"""``cite``: what to cite for a registration."""
+
+import json
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from torchdeform.cli.register import Assignments, Config, Preset
+from torchdeform.errors import InputError
+from torchdeform.pipeline.citations import bibtex
+from torchdeform.pipeline.config import load_settings, parse_override
+from torchdeform.registration.settings import RegistrationSettings
+
+ResultFile = Annotated[
+    Path | None,
+    typer.Argument(metavar="RESULT.json", show_default="settings of the options", help="Record of a registration."),
+]
+
+
+def cite(
+    result: ResultFile = None, preset: Preset = "default", config: Config = None, assignments: Assignments = None
+) -> None:
+    """Print BibTeX of what a registration uses: that of RESULT.json, or one with the settings given.
+
+    A comment above each entry says what it is cited for.
+    """
+    overrides = dict(map(parse_override, assignments or []))
+    if result is None:
+        typer.echo(bibtex(load_settings(preset, config, overrides)))
+    elif preset != "default" or config is not None or overrides:
+        raise InputError(f"{result} holds its settings; leave --preset, --config and --set out")
+    else:
+        typer.echo(bibtex(recorded_settings(result)))
+
+
+def recorded_settings(path: Path) -> RegistrationSettings:
+    """Return the settings in a ``result.json``, those that this version knows.
+
+    Raises:
+        InputError: the file cannot be read, or is no record of a registration.
+    """
+    try:
+        settings = dict(json.loads(path.read_text(encoding="utf-8"))["settings"])
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}; give the result.json of a registration") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} is no record of a registration; give the result.json in its folder") from error
+    known = {field.name for field in fields(RegistrationSettings)}
+    return load_settings(overrides={key: value for key, value in settings.items() if key in known})

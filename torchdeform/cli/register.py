@@ -1,0 +1,193 @@
+"""``register``: one pair of images, from two files to a folder of results."""
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from torchdeform.cli.options import (
+    Device,
+    FixedMask,
+    Json,
+    MovingMask,
+    Out,
+    Quiet,
+    Version,
+    among,
+    print_json,
+    table,
+)
+from torchdeform.io.files import stem
+from torchdeform.metrics.similarity import similarity_weights
+from torchdeform.pipeline.config import load_settings, parse_override, preset_names
+from torchdeform.pipeline.memory import parse_size
+from torchdeform.pipeline.register import REPORT, Outcome, PairFiles, register_files
+from torchdeform.registration.result import Progress as Step
+from torchdeform.registration.settings import ALIGNMENTS
+
+Fixed = Annotated[
+    Path,
+    typer.Argument(metavar="FIXED", help="Image that stays: PNG, TIFF, NIfTI, NRRD, a DICOM folder ..."),
+]
+Moving = Annotated[Path, typer.Argument(metavar="MOVING", help="Image that is warped onto it.")]
+FixedPoints = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", show_default=False, help="Landmarks (csv, elastix txt, Slicer), measured ..."),
+]
+MovingPoints = Annotated[
+    Path | None, typer.Option(metavar="FILE", show_default=False, help="... and the same landmarks in MOVING.")
+]
+FixedLabels = Annotated[
+    Path | None, typer.Option(metavar="FILE", show_default=False, help="Regions, whose overlap is measured ...")
+]
+MovingLabels = Annotated[
+    Path | None, typer.Option(metavar="FILE", show_default=False, help="... and the same regions of MOVING.")
+]
+Align = Annotated[
+    str | None,
+    typer.Option(
+        metavar="KIND",
+        show_default=False,
+        help=f"First: {', '.join(ALIGNMENTS)} (usual).",
+        autocompletion=among(ALIGNMENTS),
+    ),
+]
+PointsWeight = Annotated[
+    float | None, typer.Option(metavar="W", show_default="0", help="Let the landmarks pull, with this weight.")
+]
+Symmetric = Annotated[
+    bool, typer.Option("--symmetric", metavar="", help="Prefer neither image: swapping them inverts the map.")
+]
+Memory = Annotated[
+    str | None, typer.Option(metavar="SIZE", show_default="what is free", help="Take at most this, such as 4GB.")
+]
+Preset = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        show_default=False,
+        help=f"Settings to start from: {', '.join(preset_names())}.",
+        autocompletion=preset_names,
+    ),
+]
+Config = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="YAML file with settings that differ from the preset.")
+]
+Assignments = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting that differs; can be repeated.")
+]
+
+
+def register(
+    fixed: Fixed,
+    moving: Moving,
+    out: Out = None,
+    align: Align = None,
+    fixed_mask: FixedMask = None,
+    moving_mask: MovingMask = None,
+    fixed_points: FixedPoints = None,
+    moving_points: MovingPoints = None,
+    points_weight: PointsWeight = None,
+    fixed_labels: FixedLabels = None,
+    moving_labels: MovingLabels = None,
+    symmetric: Symmetric = False,
+    preset: Preset = "default",
+    config: Config = None,
+    assignments: Assignments = None,
+    memory: Memory = None,
+    device: Device = "auto",
+    json: Json = False,
+    quiet: Quiet = False,
+    version: Version = False,
+) -> None:
+    """Warp MOVING onto FIXED: an alignment, then a map that does not fold.
+
+    Writes report.html (open it: did it work?), warped.*, transform.h5, inverse.h5, displacement.nii.gz, overview.png
+    and result.json, all or none. transform.h5 takes points from FIXED to MOVING and brings the image MOVING onto FIXED;
+    inverse.h5 goes the other way.
+    """
+    shortcuts = {"align": align, "points_weight": points_weight, "symmetric": symmetric or None}
+    overrides = {key: value for key, value in shortcuts.items() if value is not None}
+    settings = load_settings(preset, config, dict(map(parse_override, assignments or [])) | overrides)
+    files = PairFiles(
+        fixed=fixed,
+        moving=moving,
+        out=out or Path(stem(moving)),
+        fixed_mask=fixed_mask,
+        moving_mask=moving_mask,
+        fixed_points=fixed_points,
+        moving_points=moving_points,
+        fixed_labels=fixed_labels,
+        moving_labels=moving_labels,
+    )
+    limit = None if memory is None else parse_size(memory)
+    with _Bar(quiet) as bar:
+        outcome = register_files(files, settings, device=device, memory=limit, callback=bar.show)
+    if json:
+        print_json({**outcome.record, "out": str(outcome.folder)})
+    elif not quiet:
+        for warning in outcome.warnings:
+            typer.echo(f"warning: {warning}", err=True)
+        typer.echo(summary(outcome))
+
+
+def summary(outcome: Outcome) -> str:
+    """Return what a person wants to know of a registration, in a few lines."""
+    r, measure = outcome.record, " + ".join(similarity_weights(outcome.result.settings.similarity))
+    lines = {
+        f"similarity ({measure})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
+        "folds": f"{r['folds']}, determinant {r['determinant_min']:.3g} to {r['determinant_max']:.3g}",
+        "inverse error": f"{r['inverse_error_mean']:.2g} voxel on average, {r['inverse_error_max']:.2g} at most",
+        **_measured(r),
+        "seconds": f"{sum(outcome.seconds.values()):.1f} on {r['device']}",
+        "results": f"{outcome.folder}{os.sep} ({', '.join(outcome.files)})",
+        "look at": str(outcome.folder / REPORT),
+    }
+    return table(lines)
+
+
+def _measured(record: dict[str, Any]) -> dict[str, str]:
+    """Return lines about labels and landmarks, where they were given."""
+    lines = {}
+    for key, name in (("dice_mean", "Dice"), ("landmark_error_mean", "landmark error")):
+        stages = [
+            stage for stage in ("before", "aligned", "after") if key in record.get("evaluation", {}).get(stage, {})
+        ]
+        if stages:
+            lines[name] = " -> ".join(f"{record['evaluation'][stage][key]:.4g}" for stage in stages)
+    return lines
+
+
+class _Bar:
+    """A progress bar on stderr, only where a person sees it."""
+
+    def __init__(self, quiet: bool) -> None:
+        console = Console(stderr=True)
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[detail]}"),
+            TimeElapsedColumn(),
+        )
+        hidden = quiet or not console.is_terminal
+        self._progress = Progress(*columns, console=console, transient=True, disable=hidden)
+        self._task = self._progress.add_task("reading", total=1.0, detail="")
+
+    def __enter__(self) -> "_Bar":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def show(self, step: Step) -> None:
+        """Show one step of the optimisation; a level counts the same whatever its size."""
+        done = (step.level + step.step / max(step.steps, 1)) / step.levels
+        size = "×".join(map(str, step.shape))
+        detail = f"step {step.step}, similarity {step.similarity.mean().item():.4g}"
+        self._progress.update(
+            self._task, completed=done, description=f"level {step.level + 1}/{step.levels} {size}", detail=detail
+        )

@@ -1,0 +1,210 @@
+"""``apply``, ``points``, ``invert``, ``compose``, ``jacobian``: transforms at the shell."""
+
+import math
+from dataclasses import replace
+from functools import reduce
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+
+from torchdeform.cli.options import Json, Quiet, among, print_json
+from torchdeform.core.image import Image
+from torchdeform.core.interpolation import COPYING, MODES
+from torchdeform.core.transform import Transform
+from torchdeform.errors import InputError, require_choice
+from torchdeform.io.files import require_writable, suffix
+from torchdeform.io.images import FORMATS, read_image, write_image
+from torchdeform.io.labels import read_labels, write_labels
+from torchdeform.io.points import read_points, require_points_file, write_points
+from torchdeform.io.transforms import read_transform, require_transform_file, write_transform
+
+TransformFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="TRANSFORM", help="Transform of ITK, ANTs or torchdeform (.h5, .mat, .tfm, .txt, or a warp .nii.gz)."
+    ),
+]
+TransformFiles = Annotated[
+    list[Path],
+    typer.Argument(metavar="FIRST SECOND ...", help="Transforms, the one that points go through first first."),
+]
+MovingFile = Annotated[Path, typer.Argument(metavar="MOVING", help="Image to bring over, any format, 2D or 3D.")]
+PointsFile = Annotated[
+    Path, typer.Argument(metavar="POINTS", help="Points: csv, tsv, elastix txt, Slicer fcsv or mrk.json.")
+]
+OutFile = Annotated[Path, typer.Option("--out", metavar="FILE", help="File to write, in the format of its ending.")]
+Reference = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="IMAGE",
+        show_default="the grid in TRANSFORM",
+        help="Fixed image, whose grid the result gets (the moving image with --inverse).",
+    ),
+]
+Counted = Annotated[
+    Path | None,
+    typer.Option(metavar="IMAGE", show_default=False, help="Image whose voxels POINTS counts, if it does."),
+]
+FieldGrid = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="IMAGE",
+        show_default="the grid in TRANSFORM",
+        help="Grid for the result, where it is a field (.nii.gz).",
+    ),
+]
+Interpolation = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        help=f"{', '.join(MODES)}; label or nearest keep values and their type.",
+        autocompletion=among(MODES),
+    ),
+]
+Inverse = Annotated[bool, typer.Option("--inverse", metavar="", help="Go the other way, by the inverse of TRANSFORM.")]
+Outside = Annotated[float, typer.Option(metavar="VALUE", help="Value where MOVING does not reach.")]
+
+
+def apply(
+    transform: TransformFile,
+    moving: MovingFile,
+    out: OutFile,
+    reference: Reference = None,
+    interpolation: Interpolation = "linear",
+    inverse: Inverse = False,
+    outside: Outside = 0.0,
+) -> None:
+    """Bring the MOVING image onto the grid of the fixed image: result(x) = MOVING(TRANSFORM(x)).
+
+    Images go from moving to fixed with the same transform that takes points from fixed to moving. With --inverse an
+    image of the fixed space goes to the moving space.
+    """
+    require_choice(interpolation, MODES, "--interpolation")
+    _prepare_image(out, transform, moving, reference)
+    labels = interpolation in COPYING
+    chain = _read(transform, inverse)
+    place = _place(chain, reference, transform)
+    image = read_labels(moving) if labels else read_image(moving)
+    result = chain.image(image, place, mode=interpolation, outside=outside)
+    (write_labels if labels else write_image)(result, out)
+
+
+def points(
+    transform: TransformFile,
+    points: PointsFile,
+    out: OutFile,
+    reference: Counted = None,
+    inverse: Inverse = False,
+) -> None:
+    """Take POINTS of the fixed image to the moving image: result = TRANSFORM(point), in world LPS mm.
+
+    Points go from fixed to moving with the same transform that brings the moving image to the fixed one. With --inverse
+    points of the moving image go to the fixed image.
+    """
+    require_points_file(out)
+    _prepare(out, transform, points, reference)
+    chain = _read(transform, inverse)
+    image = None if reference is None else read_image(reference)
+    given = read_points(points, image, dim=chain.dim)
+    write_points(replace(given, positions=chain.points(given.positions)), out)
+
+
+def invert(
+    transform: TransformFile, out: OutFile, reference: FieldGrid = None, json: Json = False, quiet: Quiet = False
+) -> None:
+    """Write the inverse of TRANSFORM, which takes points from moving to fixed and images from fixed to moving.
+
+    Affine maps are inverted exactly, displacement fields on their own grid. Prints how far a point comes to lie from
+    where it started after TRANSFORM and its inverse.
+    """
+    require_transform_file(out)
+    _prepare(out, transform, reference)
+    chain = _read(transform)
+    inverse = _on_grid(chain.inverse(), reference)
+    write_transform(inverse, out)
+    if quiet and not json:
+        return
+    mean, largest = (math.nan, math.nan) if chain.reference is None else _round_trip(chain, chain.reference)
+    if json:
+        print_json({"out": out, "inverse_error_mean_mm": mean, "inverse_error_max_mm": largest})
+    elif chain.reference is not None:
+        typer.echo(f"inverse error  {mean:.2g} mm on average, {largest:.2g} at most")
+
+
+def compose(transforms: TransformFiles, out: OutFile, reference: FieldGrid = None) -> None:
+    """Write one transform for several: points go through FIRST, then SECOND, and so on; images the other way.
+
+    The result takes points of the fixed space of FIRST to the moving space of the last, and brings images back. This
+    is the order in which ANTs lists its transforms.
+    """
+    require_transform_file(out)
+    _prepare(out, *transforms, reference)
+    if len(transforms) < 2:
+        raise InputError("compose needs two transforms at least; name them, the one that points go through first first")
+    write_transform(_on_grid(reduce(Transform.then, map(_read, transforms)), reference), out)
+
+
+def jacobian(
+    transform: TransformFile, out: OutFile, reference: Reference = None, json: Json = False, quiet: Quiet = False
+) -> None:
+    """Write the Jacobian determinant of TRANSFORM on the grid of the fixed image: moving volume over fixed volume.
+
+    Points go from fixed to moving: above 1 a piece of the fixed image is larger in the moving image, below 1 smaller,
+    0 or less is a fold.
+    """
+    _prepare_image(out, transform, reference)
+    chain = _read(transform)
+    image = chain.jacobian_determinant(_place(chain, reference, transform))
+    write_image(image, out)
+    low, high, mean = (float(f(image.data)) for f in (torch.amin, torch.amax, torch.mean))
+    folds = int((~(image.data > 0)).sum())
+    if json:
+        print_json(
+            {"out": out, "determinant_min": low, "determinant_max": high, "determinant_mean": mean, "folds": folds}
+        )
+    elif not quiet:
+        typer.echo(f"determinant  {low:.3g} to {high:.3g}, {mean:.3g} on average")
+        typer.echo(f"folds        {folds}")
+
+
+VERBS = {"apply": apply, "points": points, "invert": invert, "compose": compose, "jacobian": jacobian}
+
+
+def _read(path: Path, inverse: bool = False) -> Transform:
+    chain = read_transform(path)
+    return chain.inverse() if inverse else chain
+
+
+def _place(chain: Transform, reference: Path | None, path: Path) -> Image | None:
+    if reference is None and chain.reference is None:
+        raise InputError(f"{path} does not say which grid the result shall have; give --reference IMAGE")
+    return None if reference is None else read_image(reference)
+
+
+def _on_grid(chain: Transform, reference: Path | None) -> Transform:
+    return chain if reference is None else replace(chain, fixed=read_image(reference))
+
+
+def _prepare_image(out: Path, *inputs: Path | None) -> None:
+    if suffix(out) not in FORMATS:
+        raise InputError(f"{out} has no ending that images are written with; use one of {', '.join(FORMATS)}")
+    _prepare(out, *inputs)
+
+
+def _prepare(out: Path, *inputs: Path | None) -> None:
+    """Raise `InputError` where the result cannot be written, or would replace what it is made from."""
+    for path in inputs:
+        if path is not None and out.exists() and path.exists() and out.samefile(path):
+            raise InputError(f"--out {out} is one of the files to read; choose another name")
+    if out.is_dir():
+        raise InputError(f"--out {out} is a folder; give the name of a file")
+    require_writable(out.parent)
+
+
+def _round_trip(chain: Transform, place: Image) -> tuple[float, float]:
+    """Return mean and maximum of |φ⁻¹(φ(x)) − x| over the nodes, in mm."""
+    back = chain.then(chain.inverse()).flatten(place).field.data
+    distance = back.square().sum(dim=1).sqrt()
+    return float(distance.mean()), float(distance.max())

@@ -1,0 +1,1 @@
+"""Many pairs from one YAML file, on one machine or a cluster."""

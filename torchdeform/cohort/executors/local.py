@@ -1,0 +1,166 @@
+"""Processes of this machine, one pair at a time in each."""
+
+import os
+import queue
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchdeform.cohort.estimate import measure
+from torchdeform.cohort.executors.worker import Worker
+from torchdeform.cohort.plan import Job
+from torchdeform.cohort.settings import EngineSettings
+from torchdeform.cohort.task import Report, Task, perform
+from torchdeform.pipeline.memory import available
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Where pairs run.
+
+    Attributes:
+        executor: the executor for a job, by what the job needs.
+        window: how many jobs are handed over at a time.
+        function: what the executor calls with a task.
+        arguments: and with these besides.
+    """
+
+    executor: Callable[[Job], Executor]
+    window: int
+    function: Callable[..., Report] = perform
+    arguments: tuple[object, ...] = ()
+
+    def submit(self, task: Task) -> Future[Report]:
+        """Hand a pair over."""
+        return self.executor(task.job).submit(self.function, task, *self.arguments)
+
+
+_AHEAD = 4  # pairs in the queue per worker
+
+
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS")
+
+
+_GPUS = "CUDA_VISIBLE_DEVICES"
+
+
+class LocalExecutor(Executor):
+    """Makes calls in worker processes; a call that kills its process fails alone.
+
+    Args:
+        workers: the processes, each busy with one call at a time.
+        timeout: seconds of a call at most, None for no limit.
+
+    Notes:
+        `concurrent.futures.ProcessPoolExecutor` breaks as a whole when one of its processes dies, and cannot end a
+        call that hangs.
+    """
+
+    def __init__(self, workers: Sequence[Worker], timeout: float | None = None) -> None:
+        self._workers, self._timeout = tuple(workers), timeout
+        self._calls: queue.SimpleQueue[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]] | None]
+        self._calls = queue.SimpleQueue()
+        self._closed = False
+        self._threads = [threading.Thread(target=self._serve, args=(w,), daemon=True) for w in self._workers]
+        for thread in self._threads:
+            thread.start()
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Return the future of ``fn(*args)``; see `Worker.call` for what can go wrong."""
+        if self._closed:
+            raise RuntimeError("the executor is shut down")
+        if kwargs:
+            raise TypeError("calls take positional arguments only")
+        future: Future[Any] = Future()
+        self._calls.put((future, fn, args))
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the processes: when all calls are done, or now (``cancel_futures``), with the calls that they make."""
+        self._closed = True
+        if cancel_futures:
+            self._cancel()
+        for _ in self._threads:
+            self._calls.put(None)
+        if wait:
+            for thread in self._threads:
+                thread.join()
+
+    def _cancel(self) -> None:
+        with suppress(queue.Empty):
+            while True:
+                if (call := self._calls.get_nowait()) is not None:
+                    call[0].cancel()
+        for worker in self._workers:
+            worker.stop()
+
+    def _serve(self, worker: Worker) -> None:
+        while (call := self._calls.get()) is not None:
+            future, function, args = call
+            if future.set_running_or_notify_cancel():
+                self._settle(future, worker, function, args)
+            del call, future  # its result must not live until the next call
+        worker.stop()
+
+    def _settle(self, future: Future[Any], worker: Worker, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
+        try:
+            future.set_result(worker.call(function, *args, timeout=self._timeout))
+        except Exception as error:  # noqa: BLE001 - the future carries it
+            future.set_exception(error)
+
+
+@contextmanager
+def open_local(settings: EngineSettings, jobs: Sequence[Job]) -> Iterator[Engine]:
+    """Yield the engine of this machine for these jobs; its processes are gone at the end."""
+    gpus = visible_gpus() if any(job.device != "cpu" for job in jobs) else []
+    first = Worker(environment(0, gpus=gpus))
+    try:
+        count = settings.workers if settings.workers != "auto" else _fitting(first.call(measure, jobs), gpus)
+    finally:
+        first.stop()
+    threads = settings.threads if settings.threads != "auto" else max(1, usable_cores() // count)
+    workers = [Worker(environment(threads, slot=slot, gpus=gpus)) for slot in range(min(count, len(jobs)))]
+    executor = LocalExecutor(workers, settings.timeout)
+    try:
+        yield Engine(lambda _: executor, _AHEAD * len(workers))
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _fitting(needs: Sequence[int], gpus: Sequence[str]) -> int:
+    """Return how many pairs may run at a time: one a GPU, or a core; and no more than memory holds of the largest."""
+    free = available()
+    room = len(needs) if free is None or max(needs) == 0 else free // max(needs)
+    return max(1, min(len(gpus) or usable_cores(), len(needs), room))
+
+
+def environment(threads: int, *, slot: int = 0, gpus: Sequence[str] = ()) -> dict[str, str]:
+    """Return the variables of a worker: its threads (0 for what is set), and its own GPU if there are any."""
+    counts = dict.fromkeys(_THREADS, str(threads)) if threads else {}
+    return counts | ({_GPUS: gpus[slot % len(gpus)]} if gpus else {})
+
+
+def visible_gpus() -> list[str]:
+    """Return the GPUs that this process may use, by the names that ``CUDA_VISIBLE_DEVICES`` takes."""
+    import torch
+
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    named = [name.strip() for name in os.environ.get(_GPUS, "").split(",") if name.strip()]
+    return (named or [str(index) for index in range(count)])[:count]
+
+
+def usable_cores() -> int:
+    """Return the cores that this process may use: by affinity, and by the share that its control group has."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min([cores, *_quotas()]))
+
+
+def _quotas() -> Iterable[int]:
+    with suppress(OSError, ValueError):
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text(encoding="ascii").split()
+        if quota != "max":
+            yield int(quota) // int(period)

@@ -1,0 +1,98 @@
+"""Learn2Reg: the pairs of a data set's JSON, and the name that a submission gives to a displacement field."""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torchdeform.cohort.names import Entry, pair_name
+from torchdeform.cohort.schema import Learn2Reg
+from torchdeform.errors import InputError
+
+_PAIRS = {"train": "training_paired_images", "val": "registration_val", "test": "registration_test"}
+_LISTS = ("training", "test")
+# What goes along with an image, by a pair's name for it: keys of the JSON, the first that is there.
+_BESIDE = {"labels": ("label",), "mask": ("mask",), "points": ("landmarks", "keypoints")}
+_BOTH = ("labels", "points")  # of use only if both images have them
+_CASE = re.compile(r"_(\d{4})_(\d{4})\.nii\.gz$")
+
+
+def learn2reg_entries(source: Learn2Reg) -> list[Entry]:
+    """Return the pairs of one split of a data set.
+
+    Raises:
+        InputError: the file is missing or no JSON of a data set, or the split has no pairs.
+    """
+    content = _read(source.file)
+    key = _PAIRS[source.split]
+    pairs = content.get(key)
+    if not isinstance(pairs, list) or not pairs:
+        raise InputError(f"{source.file} names no pairs for the split {source.split} ('{key}'); choose another split")
+    beside = {_normal(image["image"]): image for image in _images(content)}
+    return [_entry(pair, beside, source.file, f"{key}[{n}]") for n, pair in enumerate(pairs)]
+
+
+def submission_name(fixed: Path, moving: Path) -> str:
+    """Return ``disp_0001_0002.nii.gz``, the name that the challenge's evaluation looks for.
+
+    Args:
+        fixed: image named ``..._CASE_MODALITY.nii.gz``, four digits each.
+        moving: as well. The modalities stand in the result unless both are the same, or 0000 and 0001.
+
+    Raises:
+        InputError: another name.
+    """
+    cases = []
+    for path in (fixed, moving):
+        found = _CASE.search(path.name)
+        if found is None:
+            raise InputError(f"{path.name} must end in _CASE_MODALITY.nii.gz, four digits each, for a submission")
+        cases.append((found[1], found[2]))
+    (one, other), modalities = (case[0] for case in cases), tuple(case[1] for case in cases)
+    if modalities[0] == modalities[1] or modalities == ("0000", "0001"):
+        return f"disp_{one}_{other}.nii.gz"
+    return f"disp_{one}_{modalities[0]}_{other}_{modalities[1]}.nii.gz"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}; check the name of the data set's JSON") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is no valid JSON: {error}; give the data set's NAME_dataset.json") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path} describes no data set; give its NAME_dataset.json")
+    return content
+
+
+def _images(content: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return what the lists of images say of each that has more than a name."""
+    listed = [image for key in _LISTS for image in content.get(key) or ()]
+    return [image for image in listed if isinstance(image, dict) and isinstance(image.get("image"), str)]
+
+
+def _normal(name: str) -> str:
+    return Path(name).as_posix()
+
+
+def _entry(pair: object, beside: Mapping[str, Mapping[str, Any]], file: Path, where: str) -> Entry:
+    if not isinstance(pair, dict) or not all(isinstance(pair.get(side), str) for side in ("fixed", "moving")):
+        raise InputError(f"{file}: {where} must name a fixed and a moving image")
+    folder = file.absolute().parent
+    files = {side: folder / pair[side] for side in ("fixed", "moving")}
+    for side in ("fixed", "moving"):
+        for what, key in _beside(beside.get(_normal(pair[side]), {})):
+            files[f"{side}_{what}"] = folder / key
+    for what in _BOTH:
+        if len({f"fixed_{what}", f"moving_{what}"} & files.keys()) == 1:
+            files = {key: path for key, path in files.items() if not key.endswith(what)}
+    name = pair_name(files["fixed"], files["moving"], {}, {})
+    return Entry(name=name, files=files, where=f"{file}: {where}", voxels=True)
+
+
+def _beside(image: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return what goes along with an image, and where it is."""
+    found = ((what, next((image[key] for key in keys if image.get(key)), None)) for what, keys in _BESIDE.items())
+    return [(what, path) for what, path in found if isinstance(path, str)]

@@ -1,0 +1,243 @@
+"""Pairs among the images that patterns find: to a template, one after another, every two, or to one of a group."""
+
+import csv
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields
+from itertools import combinations, pairwise, permutations
+from pathlib import Path
+
+from torchdeform.cohort.learn2reg import learn2reg_entries
+from torchdeform.cohort.names import Entry, entity, image_name, pair_name, shared_parts, subject_of
+from torchdeform.cohort.patterns import Found, fill, find, natural, only, search
+from torchdeform.cohort.schema import COMPANIONS, Cohort, Images, Pair, PatternPairs, checked_name
+from torchdeform.cohort.settings import beside, expand
+from torchdeform.errors import InputError, nearest_name, require_choice
+from torchdeform.io.files import suffix
+from torchdeform.pipeline.config import parse_override
+from torchdeform.pipeline.register import PairFiles
+
+_FILES = tuple(field.name for field in fields(PairFiles) if field.name != "out")
+
+
+def find_images(images: Images) -> list[Found]:
+    """Return the images that patterns or an expression find, sorted by their paths.
+
+    Raises:
+        InputError: there is none.
+
+    Notes:
+        A file that is the regions, the mask or the landmarks of another is no image of its own, though the pattern may
+        match it.
+    """
+    if images.folder is not None and images.expression is not None:
+        found = search(images.folder, images.expression)
+    else:
+        found = [one for pattern in images.files for one in find(pattern, images.parts)]
+    unique = {one.path: one for one in found}
+    beside = {path for one in unique.values() for path in _beside(one, images)}
+    left = [one for path, one in unique.items() if path not in beside]
+    if not left:
+        looked = images.expression or ", ".join(images.files)
+        raise InputError(f"no file matches {looked}; check the pattern and the folder")
+    return left
+
+
+def pattern_entries(pattern: PatternPairs, where: str) -> list[Entry]:
+    """Return the pairs of a pattern; a pair whose regions, mask or landmarks cannot be told keeps the reason."""
+    images = find_images(pattern)
+    if pattern.pairing == "template":
+        return [_to_template(one, pattern, where) for one in images if one.path != _template(one, pattern)]
+    groups: dict[tuple[str, ...], list[Found]] = defaultdict(list)
+    for one in images:
+        groups[tuple(one.parts[name] for name in pattern.within)].append(one)
+    if pattern.order is not None:
+        for group in groups.values():
+            group.sort(key=lambda one: natural(one.parts[str(pattern.order)]))
+    return [entry for group in groups.values() for entry in _PAIRINGS[pattern.pairing](group, pattern, where)]
+
+
+def companions(one: Found, images: Images, side: str) -> dict[str, Path]:
+    """Return what goes along with an image, called as a pair calls it.
+
+    Raises:
+        InputError: several files match a pattern, or none.
+    """
+    patterns = images.companions().items()
+    return {f"{side}_{COMPANIONS[key]}": only(fill(pattern, one.parts)) for key, pattern in patterns}
+
+
+def _beside(one: Found, images: Images) -> list[Path]:
+    try:
+        return list(companions(one, images, "").values())
+    except InputError:
+        return []
+
+
+def _template(moving: Found, pattern: PatternPairs) -> Path | None:
+    try:
+        return only(fill(pattern.fixed or "", moving.parts))
+    except InputError:
+        return None
+
+
+def _to_template(moving: Found, pattern: PatternPairs, where: str) -> Entry:
+    def files() -> dict[str, Path]:
+        fixed = {key: only(fill(text, moving.parts)) for key, text in pattern.fixed_files().items()}
+        return {**fixed, "moving": moving.path, **companions(moving, pattern, "moving")}
+
+    return _entry(image_name(moving.path, moving.parts), files, where, subject_of(moving.parts))
+
+
+def _consecutive(group: list[Found], pattern: PatternPairs, where: str) -> Iterator[Entry]:
+    for fixed, moving in pairwise(group):
+        yield _between(fixed, moving, pattern, where)
+
+
+def _all(group: list[Found], pattern: PatternPairs, where: str) -> Iterator[Entry]:
+    for fixed, moving in (permutations if pattern.both_ways else combinations)(group, 2):
+        yield _between(fixed, moving, pattern, where)
+
+
+def _to_member(group: list[Found], pattern: PatternPairs, where: str) -> Iterator[Entry]:
+    chosen = [one for one in group if pattern.reference.items() <= one.parts.items()]
+    if len(chosen) == 1:
+        for moving in group:
+            if moving is not chosen[0]:
+                yield _between(chosen[0], moving, pattern, where)
+        return
+    wanted = ", ".join(f"{key} {value}" for key, value in pattern.reference.items())
+    parts = {key: group[0].parts[key] for key in pattern.within}
+    name = "_".join(entity(*part) for part in parts.items()) or "group"
+    problem = f"{len(chosen)} of its {len(group)} images have {wanted}, and one must; check reference and the files"
+    yield Entry(name=name, files={}, where=where, subject=subject_of(parts), problem=problem)
+
+
+_PAIRINGS = {"consecutive": _consecutive, "all": _all, "group": _to_member}
+
+
+def _between(fixed: Found, moving: Found, pattern: PatternPairs, where: str) -> Entry:
+    """Return the pair of two images that were found."""
+
+    def files() -> dict[str, Path]:
+        sides = (("fixed", fixed), ("moving", moving))
+        beside = [companions(one, pattern, side).items() for side, one in sides]
+        return {"fixed": fixed.path, "moving": moving.path, **dict(beside[0]), **dict(beside[1])}
+
+    name = pair_name(fixed.path, moving.path, fixed.parts, moving.parts)
+    return _entry(name, files, where, subject_of(shared_parts(fixed.parts, moving.parts)))
+
+
+def _entry(name: str, files: Callable[[], dict[str, Path]], where: str, subject: str) -> Entry:
+    try:
+        return Entry(name=name, files=files(), where=where, subject=subject)
+    except InputError as error:
+        return Entry(name=name, files={}, where=where, subject=subject, problem=str(error))
+
+
+def entries(cohort: Cohort) -> list[Entry]:
+    """Return the pairs of a cohort as it names them; nothing is looked at but names.
+
+    Raises:
+        InputError: the cohort has no pairs, or what says them is wrong.
+    """
+    pairs = cohort.pairs
+    if pairs is None:
+        raise InputError(f"{cohort.path} names no pairs; add pairs with one of list, table, pattern and learn2reg")
+    if pairs.table is not None:
+        found = table_entries(pairs.table.file)
+    elif pairs.pattern is not None:
+        found = pattern_entries(pairs.pattern, f"{cohort.path}: pairs.pattern")
+    elif pairs.learn2reg is not None:
+        found = learn2reg_entries(pairs.learn2reg)
+    else:
+        found = [_listed(pair, f"{cohort.path}: pairs.list[{n}]") for n, pair in enumerate(pairs.list or ())]
+    if not found:
+        raise InputError(f"{cohort.path} comes to no pair at all; check pairs")
+    return found
+
+
+def named_images(cohort: Cohort) -> dict[str, dict[str, Path]]:
+    """Return the images of a template by their names: ``image``, and ``labels``, ``mask`` and ``points`` where given.
+
+    Raises:
+        InputError: the cohort has no images, none is found, two would have one name, or what goes along is missing.
+    """
+    if cohort.images is None:
+        raise InputError(f"{cohort.path} names no images; add images with files, the pattern of their paths")
+    named: dict[str, dict[str, Path]] = {}
+    for one in find_images(cohort.images):
+        name = image_name(one.path, one.parts)
+        if name in named:
+            paths = f"{named[name]['image']} and {one.path}"
+            raise InputError(f"{paths} would both be called {name}; name the part that differs, as {{subject}}")
+        beside = {key.lstrip("_"): path for key, path in companions(one, cohort.images, "").items()}
+        named[name] = {"image": one.path, **beside}
+    return named
+
+
+def _listed(pair: Pair, where: str) -> Entry:
+    files = {key: path for key in _FILES if (path := getattr(pair, key)) is not None}
+    name = pair.name or pair_name(pair.fixed, pair.moving, {}, {})
+    return Entry(name=name, files=files, where=where, settings=pair.settings)
+
+
+_SEPARATORS = {".csv": ",", ".tsv": "\t"}
+_COLUMNS = ("name", *_FILES)
+_SETTING = "settings."
+_EMPTY = ("", "n/a")  # BIDS writes n/a where there is nothing
+
+
+def table_entries(path: Path) -> list[Entry]:
+    """Return the pairs of a table; its paths are relative to its own folder.
+
+    Raises:
+        InputError: the file is missing, no table, lacks a column or has one that means nothing, or a row that is wrong;
+            with the line.
+    """
+    require_choice(suffix(path), _SEPARATORS, f"{path}: the ending of a table")
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}; check the name of the table") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is no text; save it as UTF-8") from error
+    reader = csv.reader(lines, delimiter=_SEPARATORS[suffix(path)])
+    titles = [title.strip() for title in next(reader, [])]
+    _require_columns(titles, path)
+    return [_row_entry(dict(zip(titles, _cells(row, titles, where), strict=True)), path.parent, where)
+            for row in reader if any(map(str.strip, row)) and (where := f"{path} line {reader.line_num}")]  # fmt: skip
+
+
+def _require_columns(titles: list[str], path: Path) -> None:
+    for title in titles:
+        if title not in _COLUMNS and not title.startswith(_SETTING):
+            hint = nearest_name(title, _COLUMNS) or f"; there are {', '.join(_COLUMNS)} and {_SETTING}KEY"
+            raise InputError(f"{path} line 1: there is no column '{title}'{hint}")
+        if titles.count(title) > 1:
+            raise InputError(f"{path} line 1: the column '{title}' stands there twice")
+    for title in ("fixed", "moving"):
+        if title not in titles:
+            raise InputError(f"{path} line 1: the column '{title}' is missing")
+
+
+def _cells(row: list[str], titles: list[str], where: str) -> list[str]:
+    if len(row) != len(titles):
+        raise InputError(f"{where}: it has {len(row)} cells and the first line {len(titles)}")
+    return [cell.strip() for cell in row]
+
+
+def _row_entry(row: Mapping[str, str], folder: Path, where: str) -> Entry:
+    given = {title: cell for title, cell in row.items() if cell not in _EMPTY}
+    for title in ("fixed", "moving"):
+        if title not in given:
+            raise InputError(f"{where}: {title} is empty")
+    try:
+        files = {key: beside(folder.resolve(), expand(given[key])) for key in _FILES if key in given}
+        name = checked_name(given["name"]) if "name" in given else pair_name(files["fixed"], files["moving"], {}, {})
+        settings = (
+            parse_override(f"{k.removeprefix(_SETTING)}={v}") for k, v in given.items() if k.startswith(_SETTING)
+        )
+        return Entry(name=name, files=files, where=where, settings=dict(settings))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error

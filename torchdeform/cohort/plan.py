@@ -1,0 +1,232 @@
+"""What a cohort comes to: its pairs as jobs, those that cannot run, and what all of it will take."""
+
+import json
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from torchdeform import __version__
+from torchdeform.cohort.learn2reg import submission_name
+from torchdeform.cohort.names import Entry, select
+from torchdeform.cohort.pairs import entries
+from torchdeform.cohort.schema import Cohort
+from torchdeform.errors import InputError, nearest_name
+from torchdeform.io import read_displacement, read_image
+from torchdeform.io.files import staged
+from torchdeform.io.learn2reg import write_voxel_displacement
+from torchdeform.pipeline.register import Outcome, PairFiles, register_files
+from torchdeform.registration.result import Callback
+from torchdeform.registration.settings import RegistrationSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A pair to register.
+
+    Args:
+        name: of the pair, unique in its cohort, of letters, digits, ``.``, ``_`` and ``-`` only.
+        files: all paths absolute; ``files.out`` is the pair's own folder inside the cohort's.
+        settings: resolved, the pair's own included.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        memory: bytes to take at most, None for what is free.
+        submission: file for the displacement as the Learn2Reg challenge reads it, None for none.
+        voxels: landmarks are rows of voxel indices without titles, as Learn2Reg has them.
+    """
+
+    name: str
+    files: PairFiles
+    settings: RegistrationSettings
+    device: str = "auto"
+    memory: int | None = None
+    submission: Path | None = None
+    voxels: bool = False
+
+
+SUBMISSION = "submission"
+
+
+DESCRIPTION = "dataset_description.json"
+
+
+# What stands in a cohort's folder beside the pairs, so no pair may be called so.
+_RESERVED = (
+    "logs",
+    SUBMISSION,
+    "journal.jsonl",
+    "summary.csv",
+    "failures.csv",
+    "index.html",
+    "events.jsonl",
+    DESCRIPTION,
+)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A pair that cannot run: its name, and a sentence that says why."""
+
+    name: str
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a cohort comes to.
+
+    Attributes:
+        out: folder of the cohort's results.
+        jobs: pairs that can run, in the order of the cohort.
+        problems: pairs that cannot.
+    """
+
+    out: Path
+    jobs: tuple[Job, ...]
+    problems: tuple[Problem, ...] = ()
+
+    def only(self, wanted: Iterable[str]) -> "Plan":
+        """Return the plan of the pairs that are called so, begin so (``sub-01``), or match a pattern (``sub-0*``).
+
+        Raises:
+            InputError: a name that no pair has.
+        """
+        names = [one.name for one in (*self.jobs, *self.problems)]
+        kept: set[str] = set()
+        for name in wanted:
+            found = select(names, name)
+            if not found:
+                raise InputError(f"--only: no pair is called {name!r}{nearest_name(name, names)}; see --dry-run")
+            kept.update(found)
+        jobs, problems = ([one for one in some if one.name in kept] for some in (self.jobs, self.problems))
+        return replace(self, jobs=tuple(jobs), problems=tuple(problems))
+
+
+def plan(cohort: Cohort) -> Plan:
+    """Return the jobs of a cohort, and the pairs that cannot run.
+
+    Raises:
+        InputError: no pair at all, two pairs that would write the same place, a name that the folder needs for
+            something else, or settings that are wrong.
+
+    Notes:
+        Of the files only their existence is looked at.
+    """
+    found = entries(cohort)
+    _require_apart(found, lambda entry: f"{entry.subject}/{entry.name}", "be called", "name")
+    if cohort.layout == "learn2reg":
+        whole = [entry for entry in found if not entry.problem]
+        _require_apart(whole, lambda entry: _submission(entry), "be submitted as", "moving image")
+    resolve = _resolver(cohort)
+    jobs: list[Job] = []
+    problems: list[Problem] = []
+    for entry in found:
+        sentence = entry.problem or _missing(entry)
+        if sentence:
+            problems.append(Problem(entry.name, sentence))
+        else:
+            jobs.append(_job(entry, cohort, resolve(entry)))
+    return Plan(cohort.out, tuple(jobs), tuple(problems))
+
+
+def description() -> dict[str, Any]:
+    """Return what a cohort's folder says of itself, in the words of BIDS for derived data."""
+    return {
+        "Name": "Registrations by torchdeform",
+        "BIDSVersion": "1.10.0",
+        "DatasetType": "derivative",
+        "GeneratedBy": [{"Name": "torchdeform", "Version": __version__}],
+    }
+
+
+def _require_apart(found: Sequence[Entry], place: Callable[[Entry], str], verb: str, remedy: str) -> None:
+    """Raise `InputError` if two pairs would write one place; capitals do not count, as on some disks."""
+    seen: dict[str, Entry] = {}
+    for entry in found:
+        key = place(entry)
+        first = seen.setdefault(key.casefold(), entry)
+        if first is not entry:
+            both = f"{_between(first)} ({first.where}) and {_between(entry)} ({entry.where})"
+            raise InputError(f"{both} would both {verb} {key.strip('/')}; give each its own {remedy}")
+        if entry.name.casefold() in _RESERVED or entry.name.startswith("."):
+            raise InputError(f"{entry.where}: a pair cannot be called {entry.name}, which the results need; rename it")
+
+
+def _between(entry: Entry) -> str:
+    ends = [str(entry.files[side]) for side in ("moving", "fixed") if side in entry.files]
+    return " to ".join(ends) or entry.name
+
+
+def _resolver(cohort: Cohort) -> Callable[[Entry], RegistrationSettings]:
+    """Return what resolves a pair's settings, each set of them once."""
+    known: dict[str, RegistrationSettings] = {}
+
+    def resolve(entry: Entry) -> RegistrationSettings:
+        key = json.dumps(entry.settings, sort_keys=True, default=str)
+        if key not in known:
+            try:
+                known[key] = cohort.resolve(entry.settings)
+            except InputError as error:
+                raise InputError(f"{entry.where}: {error}") from error
+        return known[key]
+
+    return resolve
+
+
+def _missing(entry: Entry) -> str:
+    """Return what files a pair lacks, as a sentence, empty if none."""
+    for key, path in entry.files.items():
+        if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises where a folder may not be looked into
+            return f"{key} {path} does not exist; check {entry.where}"
+    for what in ("points", "labels"):
+        given = [side for side in ("fixed", "moving") if f"{side}_{what}" in entry.files]
+        if len(given) == 1:
+            other = {"fixed": "moving", "moving": "fixed"}[given[0]]
+            return f"{given[0]}_{what} needs {other}_{what} too, give both or neither; check {entry.where}"
+    return ""
+
+
+def _job(entry: Entry, cohort: Cohort, settings: RegistrationSettings) -> Job:
+    files = PairFiles(**entry.files, out=cohort.out / entry.subject / entry.name)
+    return Job(
+        name=entry.name,
+        files=files,
+        settings=settings,
+        device=cohort.device,
+        memory=cohort.memory,
+        submission=cohort.out / SUBMISSION / _submission(entry) if cohort.layout == "learn2reg" else None,
+        voxels=entry.voxels and entry.files.keys() >= {"fixed_points", "moving_points"},
+    )
+
+
+def _submission(entry: Entry) -> str:
+    return submission_name(entry.files["fixed"], entry.files["moving"])
+
+
+_POINTS = ("fixed_points", "moving_points")
+
+
+def register_job(job: Job, *, callback: Callback | None = None) -> Outcome:
+    """Register a pair as `register_files` does, and write what else its cohort wants of it.
+
+    Raises:
+        InputError: see `register_files`.
+        ComputationError: see `register_files`.
+    """
+    files = _with_titles(job.files) if job.voxels else job.files
+    outcome = register_files(files, job.settings, device=job.device, memory=job.memory, callback=callback)
+    if job.submission is not None:
+        displacement = read_displacement(outcome.folder / "displacement.nii.gz")
+        fixed, moving = read_image(files.fixed), read_image(files.moving)
+        write_voxel_displacement(displacement.data, fixed, moving, job.submission)
+    return outcome
+
+
+def _with_titles(files: PairFiles) -> PairFiles:
+    """Return the files with landmarks written anew into the pair's folder, titled i, j, k as `read_points` wants it."""
+    given = {key: path for key in _POINTS if (path := getattr(files, key)) is not None}
+    with staged(files.out) as folder:
+        for key, path in given.items():
+            rows = path.read_text(encoding="utf-8-sig")
+            (folder / f"{key}.csv").write_text(f"i,j,k\n{rows}", encoding="utf-8")
+    return replace(files, **{key: files.out / f"{key}.csv" for key in given})

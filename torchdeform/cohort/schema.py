@@ -1,0 +1,369 @@
+"""The cohort file: what it may say, strictly typed, and how it is read."""
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, get_args
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    PrivateAttr,
+    TypeAdapter,
+    ValidationError,
+    WithJsonSchema,
+    model_validator,
+)
+from pydantic_core import ErrorDetails
+
+from torchdeform.cohort.patterns import part_names, require_parts
+from torchdeform.cohort.settings import EngineSettings, Pattern, Place, Size, Strict, TemplateSettings
+from torchdeform.errors import InputError, nearest_name, require_choice
+from torchdeform.pipeline.config import Lines, load_settings, preset_names, read_yaml, read_yaml_lines, to_yaml
+from torchdeform.registration.settings import RegistrationSettings
+
+# Keys of what goes along with an image, and how a pair calls it after its side.
+COMPANIONS = {"labels": "labels", "masks": "mask", "points": "points"}
+
+# Keys that mean something for one pairing only.
+_BELONGS = {
+    **dict.fromkeys(("fixed", "fixed_labels", "fixed_mask", "fixed_points"), "template"),
+    "reference": "group",
+    "both_ways": "all",
+}
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
+_LONGEST = 80  # characters of a wrong value that are shown
+
+
+def checked_name(name: str) -> str:
+    """Return a name that a folder can have on any system, `InputError` if it is none."""
+    if not _NAME.fullmatch(name):
+        raise InputError(
+            f"a name has letters, digits, '.', '_' and '-' only and begins with a letter or digit: {name!r}"
+        )
+    return name
+
+
+def _checked_preset(name: str) -> str:
+    require_choice(name, preset_names(), "preset")
+    return name
+
+
+def _several(value: object) -> object:
+    return (value,) if isinstance(value, str) else value
+
+
+def _checked_parts(parts: dict[str, str]) -> dict[str, str]:
+    for name, expression in parts.items():
+        _checked_expression(expression, name)
+    return parts
+
+
+def _checked_expression(expression: str, name: str = "expression") -> str:
+    try:
+        re.compile(expression)
+    except re.error as error:
+        raise InputError(f"{name}: {expression!r} is no regular expression: {error}") from error
+    return expression
+
+
+Overrides = Annotated[dict[str, Any], WithJsonSchema(TypeAdapter(RegistrationSettings).json_schema())]
+Patterns = Annotated[
+    tuple[Pattern, ...],
+    BeforeValidator(_several),
+    WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}, "minItems": 1}]}),
+]
+Name = Annotated[str, AfterValidator(checked_name)]
+Preset = Annotated[str, AfterValidator(_checked_preset)]
+Parts = Annotated[dict[str, str], AfterValidator(_checked_parts)]
+Expression = Annotated[str, AfterValidator(_checked_expression)]
+
+
+class Pair(Strict):
+    """One pair of a list."""
+
+    fixed: Place
+    """Image that stays."""
+    moving: Place
+    """Image that is warped onto it."""
+    name: Name | None = None
+    """Of the pair; from-MOVING_to-FIXED if not given."""
+    fixed_mask: Place | None = None
+    """Where the fixed image counts (not 0)."""
+    moving_mask: Place | None = None
+    """Where the moving image counts (not 0)."""
+    fixed_points: Place | None = None
+    """Landmarks of the fixed image."""
+    moving_points: Place | None = None
+    """The same landmarks in the moving image."""
+    fixed_labels: Place | None = None
+    """Regions of the fixed image."""
+    moving_labels: Place | None = None
+    """The same regions of the moving image."""
+    settings: Overrides = Field(default_factory=dict)
+    """Settings of this pair that differ from the cohort's."""
+
+
+class Table(Strict):
+    """Pairs that stand in a table, one a row."""
+
+    file: Place
+    """CSV or TSV; columns are the keys of a pair, and settings.KEY for settings that differ. Cells may be empty."""
+
+
+class Images(Strict):
+    """Images that patterns or a regular expression find, with parts of their paths named."""
+
+    files: Patterns = ()
+    """A pattern of paths, or several: *, ?, [abc], ** for any folders, {part} for a part with a name."""
+    expression: Expression | None = None
+    """Regular expression with named groups (?P<part>...), instead of files, for the whole path below the folder."""
+    folder: Place | None = None
+    """Folder that is searched with the expression."""
+    parts: Parts = Field(default_factory=dict)
+    """What a part may be, as a regular expression by its name; anything but / if not given."""
+    labels: Pattern | None = None
+    """Pattern of an image's regions, with {part} for the parts of the image's own path."""
+    masks: Pattern | None = None
+    """Pattern of an image's mask."""
+    points: Pattern | None = None
+    """Pattern of an image's landmarks."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if bool(self.files) == (self.expression is not None):
+            raise InputError("give either files (patterns) or expression (a regular expression)")
+        if (self.expression is None) != (self.folder is None):
+            raise InputError("expression needs folder, and folder stands with expression only")
+        require_parts(tuple(self.parts), self.part_names(), "parts")
+        for name, pattern in self.companions().items():
+            require_parts(part_names(pattern), self.part_names(), name)
+        return self
+
+    def part_names(self) -> tuple[str, ...]:
+        """Return the names of the parts that every image has."""
+        if self.expression is not None:
+            return tuple(re.compile(self.expression).groupindex)
+        first, *others = (part_names(pattern) for pattern in self.files)
+        return tuple(name for name in first if all(name in names for names in others))
+
+    def companions(self) -> dict[str, str]:
+        """Return the patterns of what goes along with an image, by their keys here."""
+        return {key: value for key in COMPANIONS if (value := getattr(self, key)) is not None}
+
+
+class PatternPairs(Images):
+    """Pairs among the images that patterns find."""
+
+    pairing: Literal["template", "consecutive", "all", "group"]
+    """template: each image to one fixed image. consecutive: each to the one before it. all: every two. group: each to a
+    member of its group."""
+    within: tuple[str, ...] = ()
+    """Parts that the images of a group share; all images are one group if none is named."""
+    order: str | None = None
+    """Part by which the images of a group are sorted; by their paths if not given."""
+    fixed: Pattern | None = None
+    """template: the fixed image; {part} is that of the moving image."""
+    fixed_labels: Pattern | None = None
+    """template: its regions."""
+    fixed_mask: Pattern | None = None
+    """template: its mask."""
+    fixed_points: Pattern | None = None
+    """template: its landmarks."""
+    reference: dict[str, str] = Field(default_factory=dict)
+    """group: parts of the member that stays, such as {session: pre}."""
+    both_ways: bool = False
+    """all: register every two both ways, instead of the earlier one as fixed only."""
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        known = self.part_names()
+        require_parts(self.within, known, "within")
+        require_parts((self.order,) if self.order else (), known, "order")
+        require_parts(tuple(self.reference), known, "reference")
+        for name, pattern in self.fixed_files().items():
+            require_parts(part_names(pattern), known, name)
+        for key, pairing in _BELONGS.items():
+            if getattr(self, key) and self.pairing != pairing:
+                raise InputError(f"{key} stands with pairing: {pairing} only, not with {self.pairing}")
+        for key in {"template": ("fixed",), "group": ("reference",)}.get(self.pairing, ()):
+            if not getattr(self, key):
+                raise InputError(f"pairing: {self.pairing} needs {key}")
+        for one, other in (("labels", "fixed_labels"), ("points", "fixed_points")):
+            if self.pairing == "template" and (getattr(self, one) is None) != (getattr(self, other) is None):
+                raise InputError(f"{one} and {other} stand together: what they say is compared; give both or neither")
+        return self
+
+    def fixed_files(self) -> dict[str, str]:
+        """Return the patterns of a template's files, by their keys here."""
+        keys = ("fixed", "fixed_labels", "fixed_mask", "fixed_points")
+        return {key: value for key in keys if (value := getattr(self, key)) is not None}
+
+
+class Learn2Reg(Strict):
+    """Pairs of a Learn2Reg data set."""
+
+    file: Place
+    """Its JSON, NAME_dataset.json."""
+    split: Literal["train", "val", "test"] = "val"
+    """Which of its pairs."""
+
+
+class Pairs(Strict):
+    """Where the pairs come from: one of four ways."""
+
+    list: tuple[Pair, ...] | None = None
+    """One by one."""
+    table: Table | None = None
+    """From a CSV or TSV file."""
+    pattern: PatternPairs | None = None
+    """From the names of files."""
+    learn2reg: Learn2Reg | None = None
+    """From a Learn2Reg data set."""
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        given = [name for name in type(self).model_fields if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise InputError(
+                f"pairs come from one of list, table, pattern and learn2reg, got {', '.join(given) or 'none'}"
+            )
+        return self
+
+
+class Cohort(Strict):
+    """What a cohort file says, every path absolute."""
+
+    out: Place
+    """Folder of the results."""
+    pairs: Pairs | None = None
+    """What is registered."""
+    images: Images | None = None
+    """What a template is made from."""
+    preset: Preset = "default"
+    """Settings to start from."""
+    settings: Overrides = Field(default_factory=dict)
+    """Settings that differ from the preset."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where a pair is registered."""
+    memory: Size | None = None
+    """Memory of a pair at most, such as 4GB; a pair that needs more is registered on a coarser grid."""
+    engine: EngineSettings = Field(default_factory=EngineSettings)
+    """Where the pairs run."""
+    layout: Literal["derivatives", "learn2reg"] = "derivatives"
+    """derivatives: a folder of results per pair. learn2reg: the submission of the challenge beside them."""
+    template: TemplateSettings = Field(default_factory=TemplateSettings)
+    """How a template is made."""
+
+    _path: Path = PrivateAttr(default=Path("cohort.yaml"))
+
+    @property
+    def path(self) -> Path:
+        """The file that it was read from."""
+        return self._path
+
+    def resolve(self, overrides: Mapping[str, object] | None = None) -> RegistrationSettings:
+        """Return the settings of a pair: the preset, changed by the cohort's settings, changed by ``overrides``."""
+        return load_settings(self.preset, overrides={**self.settings, **(overrides or {})})
+
+    def to_yaml(self) -> str:
+        """Return the cohort as a file that says everything: paths absolute, variables filled in, all settings."""
+        content = self.model_dump(mode="json", exclude_none=True)
+        return to_yaml(content | {"settings": asdict(self.resolve())})
+
+
+def read_cohort(path: Path) -> Cohort:
+    """Return what a cohort file says.
+
+    Raises:
+        InputError: the file cannot be read, or what is wrong in it first, with its line and the keys that lead there.
+    """
+    content, lines = read_yaml(path), read_yaml_lines(path)
+    try:
+        cohort = Cohort.model_validate(content, context={"folder": path.parent.resolve()})
+    except ValidationError as error:
+        raise InputError(_explain(error, path, lines)) from None
+    cohort._path = path
+    for keys, overrides in _overrides(cohort):
+        _require_settings(cohort, keys, overrides, lines)
+    return cohort
+
+
+def cohort_schema() -> dict[str, Any]:
+    """Return the JSON Schema of a cohort file, for editors that complete and check while one types."""
+    schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **Cohort.model_json_schema()}
+    return schema | {"title": "torchdeform cohort"}
+
+
+def _overrides(cohort: Cohort) -> Iterator[tuple[tuple[str | int, ...], dict[str, Any]]]:
+    """Yield all settings that a file holds, and the keys that lead to them."""
+    yield ("settings",), cohort.settings
+    for position, pair in enumerate((cohort.pairs.list if cohort.pairs else None) or ()):
+        if pair.settings:
+            yield ("pairs", "list", position, "settings"), pair.settings
+
+
+def _require_settings(cohort: Cohort, keys: tuple[str | int, ...], overrides: dict[str, Any], lines: Lines) -> None:
+    try:
+        cohort.resolve(overrides)
+    except InputError as error:
+        words = re.findall(r"[\w.]+", str(error))
+        key = next((key for key in overrides if key in words), None)
+        line = lines.get((*keys, key) if key else keys, 1)
+        text = str(error).removeprefix("settings: ")
+        raise InputError(f"{cohort.path} line {line}: {_dotted(keys)}: {text}") from error
+
+
+def _explain(error: ValidationError, path: Path, lines: Lines) -> str:
+    """Return the sentence about the first thing that is wrong; a key that is not known comes before what it misses."""
+    errors = error.errors(include_url=False)
+    first = next((one for one in errors if one["type"] == "extra_forbidden"), errors[0])
+    keys: tuple[str | int, ...] = ()
+    for key in first["loc"]:
+        keys = (*keys, key) if (*keys, key) in lines else keys
+    return f"{path} line {lines.get(keys, 1)}: {_sentence(first, keys)}"
+
+
+def _sentence(error: ErrorDetails, keys: tuple[str | int, ...]) -> str:
+    kind, last = error["type"], str(error["loc"][-1]) if error["loc"] else ""
+    where = f"{_dotted(keys)}: " if keys else ""
+    if kind == "extra_forbidden":
+        known = _known_keys(error["loc"][:-1])
+        hint = nearest_name(last, known) or f"; known are {', '.join(known)}"
+        return f"there is no key '{_dotted(keys)}'{hint}"
+    if kind == "missing":
+        return f"{where}'{last}' is missing"
+    message = error["msg"].removeprefix("Value error, ")
+    if kind == "value_error":
+        return f"{where}{message}"
+    value = repr(error["input"])
+    shown = value if len(value) <= _LONGEST else f"{value[:_LONGEST]} ..."
+    hint = nearest_name(str(error["input"]), re.findall(r"'(\w+)'", error.get("ctx", {}).get("expected", "")))
+    if kind == "string_type" and isinstance(error["input"], int | float):
+        hint = "; write it in quotes"
+    return f"{where}{shown}: {message}{hint}"
+
+
+def _dotted(keys: tuple[str | int, ...]) -> str:
+    """Return ``pairs.list[0].fixed``."""
+    return "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys).lstrip(".")
+
+
+def _known_keys(keys: tuple[str | int, ...]) -> list[str]:
+    """Return the keys that may stand where these keys lead; positions and the names of unions' members lead nowhere."""
+    models: list[type[BaseModel]] = [Cohort]
+    for key in keys:
+        inside = [m for model in models if key in model.model_fields for m in _models(model.model_fields[str(key)])]
+        models = inside or models
+    return list(dict.fromkeys(name for model in models for name in model.model_fields))
+
+
+def _models(field: Any) -> list[type[BaseModel]]:
+    """Return the models in a field's type."""
+    kind = getattr(field, "annotation", field)
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        return [kind]
+    return [model for part in get_args(kind) for model in _models(part)]

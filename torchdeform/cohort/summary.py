@@ -1,0 +1,174 @@
+"""The outcome of a cohort: a table of all pairs, one of those that failed, and a page that shows both."""
+
+import csv
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchdeform import __version__
+from torchdeform.cohort.plan import Job, Problem
+from torchdeform.cohort.task import DONE, FAILED, Report
+
+SUMMARY, FAILURES, PAGE = "summary.csv", "failures.csv", "index.html"
+WAITING = "waiting"
+
+FIGURES = (
+    "similarity_before",
+    "similarity_after",
+    "dice_before",
+    "dice_after",
+    "landmark_error_before",
+    "landmark_error_after",
+    "folds",
+    "determinant_min",
+    "determinant_max",
+    "inverse_error_mean",
+    "inverse_error_max",
+)
+COLUMNS = ("name", "status", *FIGURES, "seconds", "peak_memory_mb", "gpu_memory_mb", "folder")
+FAILURE_COLUMNS = ("name", "sentence", "log")
+
+_LOGS = "logs"
+
+Row = Mapping[str, str | float]
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A pair that failed: its name, a sentence that says why, and its log, None if it never ran."""
+
+    name: str
+    sentence: str
+    log: Path | None = None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What became of a cohort.
+
+    Attributes:
+        out: folder of its results.
+        done: number of pairs that are done.
+        waiting: number of pairs that have not run.
+        failures: pairs that failed.
+    """
+
+    out: Path
+    done: int
+    waiting: int
+    failures: tuple[Failure, ...]
+
+    @property
+    def failed(self) -> int:
+        """Number of pairs that failed."""
+        return len(self.failures)
+
+
+def log_of(out: Path, name: str) -> Path:
+    """Return the file for what a pair says while it runs."""
+    return out / _LOGS / f"{name}.log"
+
+
+def summarise(jobs: Sequence[Job], out: Path, known: Mapping[str, Report], problems: Iterable[Problem] = ()) -> Summary:
+    """Write ``summary.csv``, ``failures.csv`` and ``index.html``, and return what they come to.
+
+    Args:
+        jobs: all pairs that can run; those that are not known are waiting.
+        out: folder of the cohort's results.
+        known: reports by name.
+        problems: pairs that cannot run.
+    """
+    lacking = tuple(problems)
+    failures = [Failure(problem.name, problem.sentence) for problem in lacking]
+    failures += [
+        Failure(job.name, known[job.name].sentence, log_of(out, job.name))
+        for job in jobs
+        if job.name in known and known[job.name].status == FAILED
+    ]
+    rows = [_row(job, out, known.get(job.name, Report(WAITING))) for job in jobs]
+    rows += [dict.fromkeys(COLUMNS, "") | {"name": problem.name, "status": FAILED} for problem in lacking]
+    _write_table(out / SUMMARY, COLUMNS, rows)
+    _write_table(out / FAILURES, FAILURE_COLUMNS, [_failure_row(failure, out) for failure in failures])
+    write_page(out / PAGE, rows, failures)
+    counts = [row["status"] for row in rows]
+    return Summary(out, counts.count(DONE), counts.count(WAITING), tuple(failures))
+
+
+def _row(job: Job, out: Path, report: Report) -> Row:
+    folder = os.path.relpath(job.files.out, out) if report.status == DONE else ""
+    figures = {name: report.figures.get(name, "") for name in FIGURES}
+    costs = {
+        "seconds": round(report.seconds, 3) or "",
+        "peak_memory_mb": round(report.peak_memory / 1e6) or "",
+        "gpu_memory_mb": round(report.gpu_memory / 1e6) or "",
+    }
+    return {"name": job.name, "status": report.status, **figures, **costs, "folder": folder}
+
+
+def _failure_row(failure: Failure, out: Path) -> Row:
+    log = "" if failure.log is None else os.path.relpath(failure.log, out)
+    return {"name": failure.name, "sentence": failure.sentence, "log": log}
+
+
+def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
+    """Write a table that appears whole."""
+    part = path.with_name(f".{path.name}.part")
+    with part.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    part.replace(path)
+
+
+_TEMPLATES = Path(__file__).parent / "templates"
+_SHOWN = ("report.html", "overview.png")  # what a pair's name leads to, the first that is there
+_STATUSES = ("done", "failed", "waiting")
+
+
+def write_page(path: Path, rows: Sequence[Row], failures: Iterable[Failure]) -> None:
+    """Write the page of a cohort; every text in it is escaped.
+
+    Args:
+        path: the file; links are relative to its folder.
+        rows: of the summary, all with the same columns.
+        failures: what failed, with sentences and logs.
+    """
+    from jinja2 import Environment, FileSystemLoader
+
+    loader = FileSystemLoader(_TEMPLATES)
+    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    why = {failure.name: failure for failure in failures}
+    statuses = [str(row["status"]) for row in rows]
+    text = environment.get_template(path.name).stream(
+        columns=[column for column in _columns(rows) if column not in ("name", "status", "folder")],
+        rows=({"cells": row, "link": _link(path.parent, row), **_trouble(path.parent, row, why)} for row in rows),
+        counts={status: statuses.count(status) for status in _STATUSES},
+        title=path.absolute().parent.name,
+        version=__version__,
+    )
+    part = path.with_name(f".{path.name}.part")
+    with part.open("w", encoding="utf-8") as file:
+        file.writelines(text)
+    part.replace(path)
+
+
+def _columns(rows: Sequence[Row]) -> list[str]:
+    """Return the columns that some pair has a figure in."""
+    return [column for column in (rows[0] if rows else ()) if any(row[column] != "" for row in rows)]
+
+
+def _link(folder: Path, row: Row) -> str:
+    """Return what a pair's name leads to, relative to the page; empty if there is nothing."""
+    if not row["folder"]:
+        return ""
+    return next((f"{row['folder']}/{name}" for name in _SHOWN if (folder / str(row["folder"]) / name).is_file()), "")
+
+
+def _trouble(folder: Path, row: Row, why: Mapping[str, Failure]) -> dict[str, Any]:
+    failure = why.get(str(row["name"])) if row["status"] == "failed" else None
+    if failure is None:
+        return {"sentence": "", "log": ""}
+    log = failure.log
+    return {"sentence": failure.sentence, "log": log.relative_to(folder).as_posix() if log and log.is_file() else ""}

@@ -1,1 +1,0 @@
-"""The verbs of the shell, one function each; `torchdeform.cli` makes commands of them."""

@@ -1,0 +1,1 @@
+"""Tensors on grids: derivatives, warps, flows, fold checks, images and transforms. Nothing about registration."""

@@ -1,0 +1,187 @@
+"""An image in physical space: values on a grid, and where that grid lies in the world (ITK's LPS convention)."""
+
+import math
+from dataclasses import dataclass, replace
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from torchdeform.core.grid import Grid, over_slabs
+from torchdeform.core.warp import sample
+from torchdeform.errors import InputError
+
+# Alpha that means opaque, by pixel type; floating types count from 0 to 1.
+_OPAQUE = {"uint8": 255.0, "uint16": 65535.0}
+_RGBA = 4
+
+
+@dataclass(frozen=True)
+class Image:
+    """Pixel values with their place in the world.
+
+    Args:
+        data: ``(1, C, *S)`` floating point, array order (z, y, x) or (y, x).
+        grid: shape and spacing in array order.
+        origin: world position (x, y, z) of node 0 in LPS mm; zeros by default.
+        direction: ITK's direction matrix, columns are the world directions of the x, y, z index axes; identity by
+            default.
+        name: what to call it in messages, usually its path.
+        pixel_type: numpy name of the type it is stored with, for writing results alike.
+
+    Raises:
+        InputError: the parts do not fit together.
+    """
+
+    data: Tensor
+    grid: Grid
+    origin: tuple[float, ...] = ()
+    direction: tuple[tuple[float, ...], ...] = ()
+    name: str = "image"
+    pixel_type: str = "float32"
+
+    def __post_init__(self) -> None:
+        dim = self.grid.dim
+        self.grid.check(self.data, f"{self.name}: data")
+        identity = tuple(tuple(float(i == j) for j in range(dim)) for i in range(dim))
+        object.__setattr__(self, "origin", tuple(map(float, self.origin)) or (0.0,) * dim)
+        object.__setattr__(self, "direction", tuple(tuple(map(float, r)) for r in self.direction) or identity)
+        if len(self.origin) != dim or len(self.direction) != dim or {len(r) for r in self.direction} != {dim}:
+            raise InputError(f"{self.name}: origin and direction must have {dim} axes like the image")
+        if not all(map(math.isfinite, self.origin)):
+            raise InputError(f"{self.name}: its origin {self.origin} is not finite; mend the file's header")
+        if not abs(float(torch.linalg.det(torch.tensor(self.direction, dtype=torch.float64)))) > 1e-6:
+            raise InputError(f"{self.name}: its direction matrix is singular; mend the file's header")
+
+    def to_world(self, points: Tensor) -> Tensor:
+        """Map grid points ``(B, D, *T)`` (array order, units of spacing, node 0 at 0) to world points (x, y, z)."""
+        return torch.einsum("ij,bj...->bi...", self._rotation(points), points.flip(1)) + self._offset(points)
+
+    def to_grid(self, world: Tensor) -> Tensor:
+        """Map world points ``(B, D, *T)`` (x, y, z) to grid points (array order, units of spacing, node 0 at 0)."""
+        inverse = torch.linalg.inv(self._rotation(world))
+        return torch.einsum("ij,bj...->bi...", inverse, world - self._offset(world)).flip(1)
+
+    def to(self, device: torch.device | str) -> "Image":
+        """Return the same image with its pixels on ``device``."""
+        return replace(self, data=self.data.to(device))
+
+    def _rotation(self, like: Tensor) -> Tensor:
+        return torch.tensor(self.direction, dtype=like.dtype, device=like.device)
+
+    def _offset(self, like: Tensor) -> Tensor:
+        origin = torch.tensor(self.origin, dtype=like.dtype, device=like.device)
+        return origin.view(1, -1, *([1] * (like.dim() - 2)))  # points may come as a list as well as on a grid
+
+
+def resample(
+    moving: Image, fixed: Image, u: Tensor | None = None, *, mode: str = "linear", outside: float | None = 0.0
+) -> Tensor:
+    """Return moving(φ(x)) at the nodes x of ``fixed``, both taken in their physical place.
+
+    Args:
+        moving: the image to sample.
+        fixed: the image whose grid is wanted.
+        u: displacement ``(1, D, *S)`` on the fixed grid (array order, units of spacing) of φ = id + u; zero when
+            None.
+        mode: ``linear`` or ``nearest``.
+        outside: value outside the moving image (ITK's resampler uses 0); None continues its edge.
+
+    Returns:
+        ``(1, C, *S)`` on the fixed grid; the moving pixels themselves where both images have one grid and one place.
+
+    Notes:
+        One interpolation only. Coordinates are computed in float64, so far-away origins lose nothing.
+    """
+    if u is None and same_place(moving, fixed):
+        return moving.data
+    grid, device = fixed.grid, moving.data.device
+
+    def values(rows: slice) -> Tensor:
+        points = grid.points(dtype=torch.float64, device=device, rows=rows)
+        points = points if u is None else points + u[:, :, rows]
+        return sample(moving.data, moving.to_grid(fixed.to_world(points)), moving.grid, mode=mode, outside=outside)
+
+    return over_slabs(values, grid.shape, device)
+
+
+def same_place(a: Image, b: Image) -> bool:
+    """Return whether both images have the same nodes in the world."""
+    return (a.grid, a.origin, a.direction) == (b.grid, b.origin, b.direction)
+
+
+def luminance(image: Image) -> Image:
+    """Return the grey image that colour is registered on, Y = 0.299 R + 0.587 G + 0.114 B; grey images as they are.
+
+    Args:
+        image: 1 channel (grey), 3 (RGB) or 4 (RGBA; what is transparent counts as black).
+
+    Returns:
+        The image with one channel, in the same place.
+
+    Raises:
+        InputError: another number of channels.
+
+    Notes:
+        Differentiable and linear in the colours.
+    """
+    channels = image.data.shape[1]
+    if channels == 1:
+        return image
+    if channels not in (3, _RGBA):
+        raise InputError(f"{image.name} has {channels} channels; give a grey (1), RGB (3) or RGBA (4) image")
+    from kornia.color import rgb_to_grayscale
+
+    grey = rgb_to_grayscale(opaque(image).data.flatten(2).unsqueeze(-1))  # one column of pixels, whatever the dimension
+    return replace(image, data=grey.view(1, 1, *image.grid.shape))
+
+
+def opaque(image: Image) -> Image:
+    """Return an RGBA image as RGB, what is transparent counting as black; images without alpha as they are."""
+    if image.data.shape[1] != _RGBA:
+        return image
+    colours, alpha = image.data[:, :3], image.data[:, 3:]
+    return replace(image, data=colours * (alpha / _OPAQUE.get(image.pixel_type, 1.0)))
+
+
+def require_registrable(image: Image) -> None:
+    """Raise `InputError` unless the pixels are finite and not all the same: otherwise there is nothing to align."""
+    if not bool(image.data.isfinite().all()):
+        raise InputError(f"{image.name} has pixels that are NaN or infinite; replace them first, for instance by 0")
+    if bool((image.data == image.data.flatten(2)[:, :, 0].view(1, -1, *([1] * image.grid.dim))).all()):
+        raise InputError(f"{image.name} is constant, so there is nothing to align; check that it is the right file")
+
+
+def require_same_place(image: Image, other: Image, *, atol: float = 1e-3) -> None:
+    """Raise `InputError` unless the nodes of both images are the same points of the world, to ``atol`` of a voxel."""
+    if image.grid.shape != other.grid.shape:
+        sizes = f"{'×'.join(map(str, image.grid.shape[::-1]))} and {'×'.join(map(str, other.grid.shape[::-1]))}"
+        raise InputError(f"{image.name} and {other.name} must lie on one grid, but have {sizes} nodes; resample one")
+    corners = torch.tensor(list(product(*((0.0, side) for side in image.grid.extent))), dtype=torch.float64).T[None]
+    apart = (image.to_world(corners) - other.to_world(corners)).norm(dim=1).max()
+    if float(apart) > atol * min(other.grid.spacing):
+        raise InputError(
+            f"{image.name} and {other.name} must lie in one place, but their headers put them {float(apart):.3g} mm "
+            "apart; correct origin, spacing or direction in one of them"
+        )
+
+
+def overlap(fixed: Image, moving: Image, *, samples: int = 32) -> float:
+    """Return the share of the fixed grid that lies inside the moving image, 0 (apart) to 1 (covered).
+
+    Args:
+        fixed: the image whose grid is looked at.
+        moving: the image it should lie in; both are taken in their physical place.
+        samples: nodes looked at along each axis, the first and the last among them.
+
+    Raises:
+        InputError: one image is 2D and the other 3D.
+    """
+    if fixed.grid.dim != moving.grid.dim:
+        kinds = f"{fixed.name} is {fixed.grid.dim}D but {moving.name} is {moving.grid.dim}D"
+        raise InputError(f"{kinds}; give two images of the same dimension")
+    sides = [torch.linspace(0, side, samples, dtype=torch.float64) for side in fixed.grid.extent]
+    points = torch.stack(torch.meshgrid(*sides, indexing="ij")).unsqueeze(0)
+    index = moving.to_grid(fixed.to_world(points)) / moving.grid.along(moving.grid.spacing, points)
+    last = moving.grid.along([n - 1 for n in moving.grid.shape], points)
+    return float(((index >= -0.5) & (index <= last + 0.5)).all(dim=1).double().mean())

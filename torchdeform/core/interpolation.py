@@ -1,0 +1,229 @@
+"""Interpolation at scattered points: nearest, linear, cubic B-spline as ITK's resampler does it; labels by a vote."""
+
+import math
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import sample
+from torchdeform.errors import InputError, require_choice
+
+Sampler = Callable[[Tensor], Tensor]
+_Support = list[tuple[Tensor, Tensor]]  # nodes and weights
+_Kernel = tuple[tuple[float, float, float, float], ...]
+
+# The cubic B-spline on its four intervals, as polynomials in the fraction t of a voxel: t³, t², t, 1.
+_SPLINE: _Kernel = (
+    (-1 / 6, 1 / 2, -1 / 2, 1 / 6),
+    (1 / 2, -1, 0, 2 / 3),
+    (-1 / 2, 1 / 2, 1 / 2, 1 / 6),
+    (1 / 6, 0, 0, 0),
+)
+
+# A Gaussian of half a voxel takes this share to either neighbour; then the same for it and linear interpolation.
+_ASIDE = 1 / (2 + math.exp(2))
+_VOTES: _Kernel = (
+    (0, 0, -_ASIDE, _ASIDE),
+    (0, 0, 3 * _ASIDE - 1, 1 - 2 * _ASIDE),
+    (0, 0, 1 - 3 * _ASIDE, _ASIDE),
+    (0, 0, _ASIDE, 0),
+)
+
+# Nodes that vote lie at most this far from the nearest one, and points that are voted on at once.
+_ELECTORATE = 2
+_POINTS_AT_ONCE = 2**16
+
+_MAX_POOL = {2: F.max_pool2d, 3: F.max_pool3d}
+
+
+def interpolator(image: Tensor, grid: Grid, *, mode: str = "linear", outside: float | None = 0.0) -> Sampler:
+    """Return the function p ↦ image(p).
+
+    Args:
+        image: ``(1, C, *S)`` on ``grid``.
+        grid: the grid of the image.
+        mode: ``nearest`` (halves up, as ITK rounds), ``linear``, ``cubic`` (B-spline through the values, mirrored at
+            the outermost nodes; it can overshoot them), or ``label`` (of the values around, the one whose indicator is
+            largest there, smoothed by a Gaussian of half a voxel and interpolated linearly).
+        outside: value more than half a voxel outside Ω; None takes the value at the nearest point of Ω.
+
+    Returns:
+        A function of points ``(B, D, *T)`` (units of spacing, array order, float64 for full precision) that returns
+        ``(B, C, *T)`` in the image's type.
+
+    Raises:
+        InputError: shape, mode; labels that are not finite.
+
+    Notes:
+        Nearest and label keep values exactly and have no gradient in the points; linear is second order, cubic fourth,
+        both differentiable in image and points. Cubic reads 4^D nodes a point: about 20 times the time of linear in 3D.
+        So does label, but only near borders; its memory does not grow with the number of labels. At a border it is
+        linear interpolation that decides, so borders stay smooth where nearest makes steps, but also rounds off what is
+        thinner than two voxels.
+    """
+    grid.check(image, "interpolator: image")
+    require_choice(mode, _MODES, "interpolation")
+    return _MODES[mode](image, grid, outside)
+
+
+def _linear(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
+    return lambda points: sample(image, points, grid, outside=outside)
+
+
+def _nearest(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
+    values = image.flatten(2)[0]
+
+    def at(points: Tensor) -> Tensor:
+        index = _index(points, grid)
+        node = torch.zeros_like(index[0], dtype=torch.long)
+        for x, n, stride in zip(index, grid.shape, _strides(grid), strict=True):
+            node += torch.floor(x.detach() + 0.5).nan_to_num().clamp(0, n - 1).long() * stride
+        return _fill(_take(values, node), index, grid, outside)
+
+    return at
+
+
+def _label(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
+    if not bool(image.isfinite().all()):
+        raise InputError("labels must be finite numbers, but some are NaN or infinite; replace them first, say by 0")
+    nearest = _nearest(image, grid, None)
+    disputed = _nearest(_disputed(image.detach()), grid, None)
+
+    def at(points: Tensor) -> Tensor:
+        index = _index(points.detach(), grid)
+        found, unsure = nearest(points), disputed(points)
+        for channel, values in enumerate(image.detach().flatten(2)[0]):
+            there = unsure[:, channel].nonzero(as_tuple=True)
+            for some in zip(*(part.split(_POINTS_AT_ONCE) for part in there), strict=True):
+                near = [x[some].clamp(0, n - 1) for x, n in zip(index, grid.shape, strict=True)]
+                found[:, channel][some] = _elected(*_voters(values, near, grid))
+        return _fill(found, index, grid, outside)
+
+    return at
+
+
+def _disputed(image: Tensor) -> Tensor:
+    """Return where not all nodes that may vote have one label ``(1, C, *S)``, bool."""
+    low, high = -image, image
+    for axis in range(2, image.dim()):
+        reach = [_ELECTORATE if a == axis else 0 for a in range(2, image.dim())]
+        low, high = (
+            _MAX_POOL[len(reach)](part, [2 * r + 1 for r in reach], 1, reach).view(image.shape) for part in (low, high)
+        )
+    return low + high != 0
+
+
+def _voters(values: Tensor, index: list[Tensor], grid: Grid) -> tuple[Tensor, Tensor]:
+    """Return the labels of the nodes around each position, given in voxels, and their weights, ``(4^D, N)`` each."""
+    nodes = torch.zeros_like(index[0], dtype=torch.long).unsqueeze(0)
+    weights = torch.ones_like(nodes, dtype=torch.float32)
+    for x, n, stride in zip(index, grid.shape, _strides(grid), strict=True):
+        near = _support(x, n, stride, torch.float32, _VOTES)
+        nodes = torch.cat([nodes + node for node, _ in near])
+        weights = torch.cat([weights * weight for _, weight in near])
+    return values[nodes], weights
+
+
+def _elected(labels: Tensor, weights: Tensor) -> Tensor:
+    """Return for each column the label with the largest sum of weights: the heaviest node's first, then the rest's."""
+    winner, best = labels[0].clone(), torch.zeros_like(weights[0])
+    still = torch.arange(len(winner), device=winner.device)
+    while len(still):
+        heaviest = weights.argmax(0, keepdim=True)
+        candidate = labels.gather(0, heaviest)
+        votes = weights * (labels == candidate)
+        total, weights = votes.sum(0), weights - votes
+        better = total > best[still]
+        winner[still[better]], best[still[better]] = candidate[0, better], total[better]
+        going = weights.sum(0) > best[still]
+        still, labels, weights = still[going], labels[:, going], weights[:, going]
+    return winner
+
+
+def _cubic(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
+    coefficients = spline_coefficients(image, grid).flatten(2)[0]
+
+    def at(points: Tensor) -> Tensor:
+        index = _index(points, grid)
+        if outside is None:
+            index = tuple(x.clamp(0, n - 1) for x, n in zip(index, grid.shape, strict=True))
+        along = zip(index, grid.shape, _strides(grid), strict=True)
+        supports = [_support(x, n, stride, image.dtype, _SPLINE) for x, n, stride in along]
+        start = torch.zeros_like(index[0], dtype=torch.long)
+        return _fill(_weighted_sum(coefficients, supports, start), index, grid, outside)
+
+    return at
+
+
+def _weighted_sum(values: Tensor, supports: list[_Support], start: Tensor) -> Tensor:
+    """Return Σ w_a Σ w_b .. values[start + a + b + ..] over the four nodes a, b, .. along each axis."""
+    if not supports:
+        return _take(values, start)
+    terms = [w.unsqueeze(1) * _weighted_sum(values, supports[1:], start + node) for node, w in supports[0]]
+    return sum(terms[1:], start=terms[0])
+
+
+_MODES: dict[str, Callable[[Tensor, Grid, float | None], Sampler]] = {
+    "nearest": _nearest,
+    "linear": _linear,
+    "cubic": _cubic,
+    "label": _label,
+}
+MODES = tuple(_MODES)
+
+# The mode that labels are carried with where nobody asks for another, and those that copy values.
+LABEL_MODE = "label"
+COPYING = ("nearest", LABEL_MODE)
+
+
+def spline_coefficients(image: Tensor, grid: Grid) -> Tensor:
+    """Return c with Σ_j c_j B(i − j) = image_i along every axis, B the cubic B-spline, mirrored at the last nodes.
+
+    Notes:
+        The kernel (1/6, 4/6, 1/6) is a product on the Fourier side of the mirrored row: (2 + cos ω) / 3. Exact.
+    """
+    for axis, n in zip(grid.axes, grid.shape, strict=True):
+        mirrored = torch.cat((image, image.narrow(axis, 1, n - 2).flip(axis)), dim=axis)
+        waves = torch.arange(n, dtype=image.dtype, device=image.device) * (math.pi / (n - 1))
+        response = ((2 + waves.cos()) / 3).view(-1, *([1] * (image.dim() - 1 - axis)))
+        spectrum = torch.fft.rfft(mirrored, dim=axis) / response
+        image = torch.fft.irfft(spectrum, n=2 * n - 2, dim=axis).narrow(axis, 0, n)
+    return image
+
+
+def _index(points: Tensor, grid: Grid) -> tuple[Tensor, ...]:
+    """Return for each axis the position in voxels ``(B, *T)``."""
+    return tuple(points[:, k] / h for k, h in enumerate(grid.spacing))
+
+
+def _strides(grid: Grid) -> tuple[int, ...]:
+    """Return by how much the position in the flattened grid grows from node to node along each axis."""
+    return tuple(math.prod(grid.shape[k + 1 :]) for k in range(grid.dim))
+
+
+def _support(index: Tensor, count: int, stride: int, dtype: torch.dtype, kernel: _Kernel) -> _Support:
+    """Return the four nodes around each position along one axis, mirrored into the grid, and their weights."""
+    start = torch.floor(index.detach())
+    t = (index - start).to(dtype)
+    first, period = start.nan_to_num().clamp(-(2.0**52), 2.0**52).long() - 1, 2 * (count - 1)
+    nodes = ((first + step) % period for step in range(4))
+    weights = (((a * t + b) * t + c) * t + d for a, b, c, d in kernel)
+    return [(torch.minimum(n, period - n) * stride, w) for n, w in zip(nodes, weights, strict=True)]
+
+
+def _take(values: Tensor, nodes: Tensor) -> Tensor:
+    """Return values ``(C, N)`` at positions ``(B, *T)`` of the flattened grid as ``(B, C, *T)``."""
+    return values.index_select(1, nodes.flatten()).view(-1, *nodes.shape).movedim(0, 1)
+
+
+def _fill(values: Tensor, index: tuple[Tensor, ...], grid: Grid, outside: float | None) -> Tensor:
+    """Put ``outside`` where the nearest node, were the grid continued, is not of the grid."""
+    if outside is None:
+        return values
+    inside = torch.ones_like(index[0], dtype=torch.bool)
+    for x, n in zip(index, grid.shape, strict=True):
+        inside &= (x >= -0.5) & (x < n - 0.5)
+    return torch.where(inside.unsqueeze(1), values, outside)

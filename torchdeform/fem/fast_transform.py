@@ -1,0 +1,244 @@
+"""The direct solver: sines and cosines diagonalise the div-curl least squares on a box with constant weights.
+
+On one axis with n nodes at distance h let M, K, C be the matrices of ∫NᵢNⱼ, ∫Nᵢ'Nⱼ', ∫Nᵢ'Nⱼ. For θ = π j/(n − 1), with
+E = diag(½, 1, .., 1, ½) where the ends are free (cos), and on the inner nodes where they are zero (sin),
+
+    M cos = μ E cos,   K cos = κ E cos,   M sin = μ sin,   K sin = κ sin,   μ = h (2 + cos θ)/3,   κ = 2 (1 − cos θ)/h,
+    C cos = s sin,     Cᵀ cos = −s sin,   Cᵀ sin = s E cos,   C sin = −s E cos,   s = sin θ.
+
+Let each pair of opposite faces be slip or tangential. With sines along the axes where a component vanishes and cosines
+along the others, each set of frequencies (j_1, .., j_D) is a D×D block of its own: the Kronecker products of M and K
+stand on its diagonal, w_div C⊗Cᵀ − w_curl Cᵀ⊗C off it. Divided by Π μ, with λ = κ/μ, δ = w_div − w_curl, and t = s/μ
+across slip faces, −s/μ across tangential ones, it is
+
+    B = diag(d) + δ t tᵀ,   d_k = w_curl (Σ_{a≠k} λ_a + t_k²) + w_div r_k + w_zero,   r = λ − t² = ((1 − cos θ)/μ)² / 3,
+
+inverted by the formula of Sherman and Morrison. With w_div = w_curl = w it is the number w Σ λ + w_zero, also where all
+of v vanishes on some faces: there C is antisymmetric, so the coupling is δ C⊗Cᵀ and goes with δ. All of this holds
+exactly for the discrete system.
+"""
+
+import math
+from functools import reduce
+
+import torch
+from torch import Tensor
+
+from torchdeform.core.grid import Grid
+from torchdeform.errors import InputError
+from torchdeform.fem.boundary import Boundary, Face, fixes, resolve_boundary
+from torchdeform.fem.weights import Weights
+from torchdeform.solvers.sine_cosine import Kind, Kinds, separable_transform
+
+
+class TransformSolver:
+    """Solve K v = load, K the Q1 matrix of ∫ w_div (div v)² + w_curl |curl v|² + w_zero |v|², by fast transforms.
+
+    Args:
+        grid: the grid of v.
+        weights: constant over space (they may vary over the batch: shape ``(B, 1, *1)``).
+        boundary: as `resolve_boundary`; all values given are zero.
+        dtype: floating type of the loads to come.
+        device: their device.
+
+    Raises:
+        InputError: weights that vary over space or are out of range, an unknown boundary.
+
+    Attributes:
+        exact: True when `solve` is the inverse of K, see `transform_is_exact`. Otherwise it is a preconditioner: the
+            inverse of a symmetric positive definite operator near K.
+
+    Notes:
+        Factors are computed once. A solve costs 2·D transforms. Differentiable in the load to every degree, and in
+        weights that are tensors. A solver keeps working memory: use one per thread.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        weights: Weights,
+        boundary: Boundary = "slip",
+        *,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+    ) -> None:
+        weights.check(grid)
+        if not weights.constant:
+            raise InputError(
+                "TransformSolver: weights must not vary over space; Weights.mean() makes a preconditioner of them"
+            )
+        self.grid = grid
+        self.exact = transform_is_exact(grid, weights, boundary)
+        self.kinds = _kinds(resolve_boundary(boundary, grid.dim), grid.dim)
+        like = torch.empty(0, dtype=dtype, device=device)
+        symbols = [_Symbols(grid, axis, like) for axis in range(grid.dim)]
+        coupled = self.exact and not weights.isotropic
+        weights = weights.to(like)
+        self._modes = _CoupledModes(symbols, weights, self.kinds) if coupled else _ScalarModes(symbols, weights)
+        self._needs_grad = any(w.requires_grad for w in weights.tensors)
+        self._like, self._workspace = like, like
+
+    def solve(self, load: Tensor, *, power: int = 1) -> Tensor:
+        """Return v = (M⁻¹K)^−power M⁻¹ load, M being the mass matrix; power 1 solves K v = load.
+
+        Args:
+            load: assembled right-hand side ``(B, D, *S)``, one number per test function (M times a field, not a field).
+                What it says about components that the boundary condition gives is left out.
+            power: 1, or more for a smoother v: each further power divides the modes of frequency ξ by w |ξ|² + w_zero.
+
+        Returns:
+            v ``(B, D, *S)``, zero where the boundary condition gives it.
+
+        Raises:
+            InputError: shape, type or device of the load, or a power below 1.
+        """
+        self.grid.check_vector(load, "TransformSolver.solve: load")
+        if (load.dtype, load.device) != (self._like.dtype, self._like.device):
+            made, got = (f"{t.dtype} on {t.device}" for t in (self._like, load))
+            raise InputError(f"TransformSolver.solve: made for {made}, got a load of {got}")
+        if power < 1:
+            raise InputError(f"TransformSolver.solve: power must be at least 1, got {power}")
+        modes = separable_transform(load, self.kinds, out=self._buffer(load))
+        return separable_transform(self._modes.divide(modes, power), self.kinds)
+
+    def _buffer(self, load: Tensor) -> Tensor | None:
+        """Memory for the modes, kept as new pages cost a fifth of a solve; None where autograd holds on to them."""
+        if torch.is_grad_enabled() and (load.requires_grad or self._needs_grad):
+            return None
+        if self._workspace.shape != load.shape:
+            with torch.inference_mode(False):
+                self._workspace = load.new_empty(load.shape)
+        return self._workspace
+
+
+def transform_is_exact(grid: Grid, weights: Weights, boundary: Boundary) -> bool:
+    """Tell whether `TransformSolver` inverts K exactly.
+
+    Args:
+        grid: the grid of v.
+        weights: the weights.
+        boundary: as `resolve_boundary`.
+
+    Returns:
+        True for weights constant over space, opposite faces of one kind, no free face, and either w_div = w_curl or no
+        face where all of v is given; provided that K can be inverted at all.
+
+    Raises:
+        InputError: as `resolve_boundary`.
+    """
+    faces = resolve_boundary(boundary, grid.dim)
+    allowed = {"slip", "no_slip_tangential"} | ({"dirichlet"} if weights.isotropic else set())
+    paired = all(faces[Face(axis, 0)] == faces[Face(axis, 1)] for axis in range(grid.dim))
+    # Between slip faces and one pair of tangential ones a constant field flows freely, and only w_zero holds it.
+    held = all("sine" in along for along in _kinds(faces, grid.dim)) or weights.zero_positive
+    return weights.constant and paired and held and set(faces.values()) <= allowed
+
+
+def _kinds(faces: dict[Face, str], dim: int) -> Kinds:
+    """Sines for component k along an axis where both faces give it, else cosines, which miss no free unknown."""
+    given = [[all(fixes(faces, Face(axis, side), k) for side in (0, 1)) for axis in range(dim)] for k in range(dim)]
+    return tuple(tuple("sine" if both else "cosine" for both in row) for row in given)
+
+
+def solve_poisson(load: Tensor, grid: Grid) -> Tensor:
+    """Return the Q1 function w with ∫ ∇w·∇N = load(N) inside and w = 0 on the boundary.
+
+    Args:
+        load: assembled right-hand side ``(B, C, *S)``, each channel for itself; entries on the boundary are left out.
+        grid: the grid.
+
+    Returns:
+        ``(B, C, *S)``.
+
+    Raises:
+        InputError: shape.
+
+    Notes:
+        Exact, by sine transforms; differentiable to every degree.
+    """
+    grid.check(load, "solve_poisson: load")
+    sines: tuple[Kind, ...] = tuple("sine" for _ in grid.shape)
+    kinds = (sines,) * load.shape[1]
+    modes = _ScalarModes([_Symbols(grid, axis, load) for axis in range(grid.dim)], Weights())
+    return separable_transform(modes.divide(separable_transform(load, kinds), 1), kinds)
+
+
+class _Symbols:
+    """What the 1D matrices do to the modes of one axis, as tensors like ``like`` that broadcast over ``(B, C, *S)``.
+
+    ``mass`` also holds the squared length of a mode, Σ E cos² = (n − 1)/2, twice that at the two ends.
+    """
+
+    def __init__(self, grid: Grid, axis: int, like: Tensor) -> None:
+        size, spacing = grid.shape[axis], grid.spacing[axis]
+        theta = torch.arange(size, dtype=torch.float64) * (math.pi / (size - 1))
+        # 1 − cos θ without cancellation; the last sine is zero, not 1e-16.
+        versine, sine = 2 * (theta / 2).sin() ** 2, theta.sin()
+        sine[-1] = 0.0
+        mu = spacing * (3 - versine) / 3
+        norm = torch.full_like(theta, (size - 1) / 2)
+        norm[[0, -1]] = float(size - 1)
+        shape = [1, 1, *(size if a == axis else 1 for a in range(grid.dim))]
+        self.mass = (norm * mu).view(shape).to(like)
+        self.stiffness = (2 * versine / (spacing * mu)).view(shape).to(like)
+        self.mixed = (sine / mu).view(shape).to(like)
+        self.rest = ((versine / mu) ** 2 / 3).view(shape).to(like)
+        self.lowest = float(self.stiffness.flatten()[1])
+
+
+class _ScalarModes:
+    """w_div = w_curl: every mode is divided by one number. Other weights are replaced by their mean."""
+
+    def __init__(self, symbols: list[_Symbols], weights: Weights) -> None:
+        weight = (weights.div + weights.curl) / 2
+        total = weight * reduce(torch.add, [s.stiffness for s in symbols]) + weights.zero
+        inverse = 1 / _held(total, weights, symbols)
+        self.first = inverse / reduce(torch.mul, [s.mass for s in symbols])
+        self.further = inverse
+
+    def divide(self, modes: Tensor, power: int) -> Tensor:
+        modes = _scale(modes, self.first)
+        for _ in range(power - 1):
+            modes = _scale(modes, self.further)
+        return modes
+
+
+class _CoupledModes:
+    """w_div ≠ w_curl: B⁻¹ b = y − (t/d) δ (t·y)/(1 + δ Σ t²/d) with y = b/d for every mode."""
+
+    def __init__(self, symbols: list[_Symbols], weights: Weights, kinds: Kinds) -> None:
+        signs = [1.0 if along[k] == "sine" else -1.0 for k, along in enumerate(kinds)]
+        mixed = [s.mixed * sign for s, sign in zip(symbols, signs, strict=True)]
+        diagonal = []
+        for k, own in enumerate(symbols):
+            others = reduce(torch.add, [own.mixed**2] + [s.stiffness for a, s in enumerate(symbols) if a != k])
+            d = weights.curl * others + weights.div * own.rest + weights.zero
+            diagonal.append(_held(d, weights, symbols))
+        delta = weights.div - weights.curl
+        squares = reduce(torch.add, [t**2 / d for t, d in zip(mixed, diagonal, strict=True)])
+        self.gain = delta / (1 + delta * squares)
+        self.mixed = mixed
+        self.inverse = torch.cat([1 / d for d in diagonal], dim=1)
+        self.mass = 1 / reduce(torch.mul, [s.mass for s in symbols])
+
+    def divide(self, modes: Tensor, power: int) -> Tensor:
+        modes = _scale(modes, self.mass)
+        for _ in range(power):
+            modes = _scale(modes, self.inverse)
+            along = self.gain * reduce(torch.add, [t * modes[:, k : k + 1] for k, t in enumerate(self.mixed)])
+            for k, t in enumerate(self.mixed):
+                modes[:, k : k + 1].addcmul_(along * t, self.inverse[:, k : k + 1], value=-1.0)
+        return modes
+
+
+def _held(divisor: Tensor, weights: Weights, symbols: list[_Symbols]) -> Tensor:
+    """Treat the constant mode as the next one where nothing (to speak of) holds it: a preconditioner may meet it."""
+    lowest = (weights.div + weights.curl) / 2 * min(s.lowest for s in symbols)
+    return torch.where(divisor > lowest * torch.finfo(divisor.dtype).eps ** 2, divisor, lowest)
+
+
+def _scale(modes: Tensor, factor: Tensor) -> Tensor:
+    """Return modes · factor, in the memory of ``modes`` where it fits and autograd does not need it any more."""
+    if factor.requires_grad or factor.shape[0] > modes.shape[0]:
+        return modes * factor
+    return modes.mul_(factor)

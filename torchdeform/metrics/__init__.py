@@ -1,0 +1,1 @@
+"""How alike two images are, with derivatives, and how well labels and landmarks agree."""

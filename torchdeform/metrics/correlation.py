@@ -1,0 +1,253 @@
+"""Normalised cross-correlation, of whole images and of the windows around each voxel."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from torchdeform.core.resampling import box_spread, box_sum, centres
+from torchdeform.metrics.base import (
+    Similarity,
+    Span,
+    at_least_float32,
+    channel_mean,
+    mean,
+    on_unit_scale,
+    relative_weight,
+    times,
+)
+
+# Added to both variances of LNCC, for images scaled to [0, 1]: windows flatter than a grey level of 0.3 % are flat.
+LNCC_FLOOR = 1e-5
+
+# Added to both variances of NCC: images flatter than a grey level of 0.01 % are flat.
+NCC_FLOOR = 1e-8
+
+# A window with less weight than this is empty. Its square root is far from float32's smallest number.
+_EMPTY = 1e-20
+
+
+class CrossCorrelation(Similarity):
+    """S = mean over channels of c / √((v_f + ε)(v_w + ε)), covariance and variances over the whole image.
+
+    Args:
+        fixed: ``(B, C, *S)``, scaled to about [0, 1].
+
+    Notes:
+        Lies in [−1, 1]; a reversed contrast gives −1. With f̂ and ŵ less their means, the derivative by warped is
+        f̂ / √((v_f + ε)(v_w + ε)) − S ŵ / (v_w + ε).
+    """
+
+    def __init__(self, fixed: Tensor) -> None:
+        self.fixed = at_least_float32(fixed)
+
+    @cached_property
+    def _whole(self) -> tuple[Tensor, Tensor]:
+        return _centred(self.fixed, None)
+
+    def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        warped = at_least_float32(warped)
+        weight = relative_weight(mask, warped)
+        fixed, fixed_variance = self._whole if weight is None else _centred(self.fixed, weight)
+        warped, variance = _centred(warped, weight)
+        scale = (fixed_variance * variance).rsqrt()
+        value = channel_mean(fixed * warped, weight) * scale
+        return value.flatten(1).mean(1), times(scale * fixed - (value / variance) * warped, weight)
+
+
+def ncc(fixed: Tensor, warped: Tensor, *, mask: Tensor | None = None, span: Span = None) -> Tensor:
+    """Return S = c / √((v_f + ε)(v_w + ε)), the correlation of two images, 1 at best and −1 for reversed contrast.
+
+    Args:
+        fixed: ``(B, C, *S)``, any unit.
+        warped: the same shape, any unit.
+        mask: weight of each voxel ``(B, 1, *S)``, 0 to 1; all ones when None.
+        span: intensities taken for 0 and 1, which gives ε = 1e-8 its meaning; None: the smallest and the largest of
+            each image where the mask is positive.
+
+    Returns:
+        ``(B,)``, the mean over channels. Flat images give 0.
+
+    Raises:
+        InputError: shapes.
+
+    Notes:
+        Differentiable. `CrossCorrelation` has the derivative in closed form.
+    """
+    fixed, warped = on_unit_scale(fixed, warped, mask, span)
+    weight = relative_weight(mask, warped)
+    (fixed, fixed_variance), (warped, variance) = _centred(fixed, weight), _centred(warped, weight)
+    return (channel_mean(fixed * warped, weight) * (fixed_variance * variance).rsqrt()).flatten(1).mean(1)
+
+
+def _centred(image: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the image less its mean, and its variance + ε ``(B, C, 1, ..)``."""
+    image = image - channel_mean(image, weight)
+    return image, channel_mean(image * image, weight) + NCC_FLOOR
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """What is known of the windows before anything is warped, one number for each window ``(B, C or 1, *W)``.
+
+    Attributes:
+        weight: of the voxels ``(B or 1, 1, *S)``, 1 on average; None for 1 everywhere.
+        own: weight of a window, that of the voxel in its middle, 1 on average; None for 1 everywhere.
+        share: 1 / weight of its voxels.
+        mean: of the fixed image in it.
+        variance: of the fixed image in it, + ε.
+    """
+
+    weight: Tensor | None
+    own: Tensor | None
+    share: Tensor
+    mean: Tensor
+    variance: Tensor
+
+
+class LocalCrossCorrelation(Similarity):
+    """S = mean over x of c² / ((v_f + ε)(v_w + ε)), covariance and variances in the window around x.
+
+    Args:
+        fixed: ``(B, C, *S)``, scaled to about [0, 1].
+        window: width in voxels, odd. At the boundary the part of the window inside the image counts.
+        stride: voxels from one x to the next along every axis.
+
+    Notes:
+        Lies in [0, 1]. With a = 2c/((v_f + ε)(v_w + ε)), b = a c/(v_w + ε) and E the mean over a window, the
+        derivative by warped(y) is Σ [a (fixed(y) − E fixed) − b (warped(y) − E warped)] over the windows that hold y,
+        each divided by its number of voxels. ε = 1e-5 keeps flat regions finite: they count as not correlated.
+        A mask weights the voxels of a window and the windows: E becomes the weighted mean.
+        Box sums of 3 fields and the transpose of 3 a call; 3 more for a mask that is not the one of the call before.
+        With stride 3, as `register` has it with windows of 9, what lies between is a 27th in 3D, and maps are as good.
+        Not differentiable, see `lncc`.
+    """
+
+    def __init__(self, fixed: Tensor, window: int = 9, stride: int = 1) -> None:
+        self.fixed, self.window, self.stride = at_least_float32(fixed), window, stride
+        self._last: tuple[Tensor | None, int, _Windows] | None = None
+
+    def _windows(self, mask: Tensor | None, warped: Tensor) -> _Windows:
+        """Return what depends on the mask only; kept for the next call, in which it is often the same."""
+        version = 0 if mask is None or mask.is_inference() else mask._version
+        if self._last is None or self._last[0] is not mask or self._last[1] != version:
+            windows = _windows(self.fixed, relative_weight(mask, warped), self.window, self.stride)
+            self._last = mask, version, windows
+        return self._last[2]
+
+    @torch.no_grad()
+    def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        warped = at_least_float32(warped)
+        around = self._windows(mask, warped)
+        sums = box_sum(_products(warped, self.fixed, around.weight), self.window, self.stride).mul_(around.share)
+        warped_mean, square, product = sums.chunk(3, dim=1)
+        covariance = product.addcmul_(warped_mean, around.mean, value=-1)
+        variance = square.addcmul_(warped_mean, warped_mean, value=-1).clamp_(min=0).add_(LNCC_FLOOR)
+        correlation = times(covariance / (variance * around.variance), around.own)
+        value = mean(correlation * covariance)
+        a = correlation.mul_(around.share * (2 * warped[0, 0].numel() / correlation[0, 0].numel()))
+        b = a * covariance / variance
+        back = torch.cat([a, b, b * warped_mean - a * around.mean], dim=1)
+        a, b, rest = box_spread(back, self.window, self.stride, tuple(warped.shape[2:])).chunk(3, dim=1)
+        slope = torch.addcmul(rest, self.fixed, a).addcmul_(warped, b, value=-1)
+        return value, slope if around.weight is None else slope.mul_(around.weight)
+
+
+def lncc(
+    fixed: Tensor,
+    warped: Tensor,
+    *,
+    mask: Tensor | None = None,
+    window: int = 9,
+    span: Span = None,
+    stride: int = 1,
+) -> Tensor:
+    """Return S = mean over x of c² / ((v_f + ε)(v_w + ε)), covariance and variances in the window around x.
+
+    Args:
+        fixed: ``(B, C, *S)``, any unit.
+        warped: the same shape, any unit.
+        mask: weight of each voxel ``(B, 1, *S)``, 0 to 1, in the windows and of the windows; all ones when None.
+        window: width in voxels, odd. At the boundary the part of the window inside the image counts.
+        span: intensities taken for 0 and 1, which gives ε = 1e-5 its meaning; None: the smallest and the largest of
+            each image where the mask is positive.
+        stride: voxels from one x to the next along every axis.
+
+    Returns:
+        ``(B,)`` between 0 and 1. Flat windows give 0.
+
+    Raises:
+        InputError: shapes.
+
+    Notes:
+        Differentiable. `LocalCrossCorrelation` has the derivative in closed form.
+    """
+    fixed, warped = on_unit_scale(fixed, warped, mask, span)
+    around = _windows(fixed, relative_weight(mask, warped), window, stride)
+    warped_mean, variance = _moments(warped, around.weight, around.share, window, stride)
+    product = box_sum(times(fixed * warped, around.weight), window, stride) * around.share
+    covariance = product - around.mean * warped_mean
+    return mean(covariance.square() / (around.variance * variance), around.own)
+
+
+def _windows(fixed: Tensor, weight: Tensor | None, window: int, stride: int) -> _Windows:
+    ones = fixed.new_ones(1, 1, *fixed.shape[2:]) if weight is None else weight
+    share = 1 / box_sum(ones, window, stride).clamp(min=_EMPTY)
+    own = None if weight is None else relative_weight(middle := centres(weight, stride), middle)
+    return _Windows(weight, own, share, *_moments(fixed, weight, share, window, stride))
+
+
+def _moments(image: Tensor, weight: Tensor | None, share: Tensor, window: int, stride: int) -> tuple[Tensor, Tensor]:
+    """Return mean and variance + ε in the window around each voxel."""
+    weighted = times(image, weight)
+    first, square = (box_sum(torch.cat([weighted, weighted * image], dim=1), window, stride) * share).chunk(2, dim=1)
+    return first, (square - first * first).clamp(min=0) + LNCC_FLOOR
+
+
+def _products(warped: Tensor, fixed: Tensor, weight: Tensor | None) -> Tensor:
+    """Return weight · warped, weight · warped² and weight · warped · fixed side by side; no memory but theirs."""
+    items, channels, *shape = warped.shape
+    fields = warped.new_empty(items, 3 * channels, *shape)
+    weighted, square, product = fields.chunk(3, dim=1)
+    weighted.copy_(warped)
+    if weight is not None:
+        weighted.mul_(weight)
+    torch.mul(weighted, warped, out=square)
+    torch.mul(weighted, fixed, out=product)
+    return fields
+
+
+# Windows with this standard deviation count half, on the scale where the image's range is 1.
+_DETAIL = 0.01
+
+# Images are multiplied by this, which makes the floor of LNCC that much smaller than the detail.
+_GAIN = 10.0
+
+
+class DetailCorrelation(Similarity):
+    """S = mean of LNCC over x, weighted by t(x) = v² / (v² + τ⁴), v being the variance of the fixed image around x.
+
+    Args:
+        fixed: ``(B, C, *S)``, scaled to about [0, 1].
+        window: width in voxels, odd.
+
+    Notes:
+        LNCC adds ε to both variances, so a flat window counts as not correlated, and a map that enlarges the moving
+        image until something covers the background gains. With t, and with ε small against τ², S is 1 for images that
+        agree, and the map that is found is the true one: blobs of 10 voxels on an empty background came out up to
+        5 voxels off with LNCC, and are less than 0.1 off with this.
+    """
+
+    def __init__(self, fixed: Tensor, window: int) -> None:
+        self.inner = LocalCrossCorrelation(fixed * _GAIN, window)
+        ones = torch.ones_like(fixed[:, :1])
+        count = box_sum(ones, window)
+        mean = box_sum(fixed, window) / count
+        variance = (box_sum(fixed * fixed, window) / count - mean * mean).clamp(min=0).amax(1, keepdim=True)
+        self.detail = variance**2 / (variance**2 + _DETAIL**4)
+
+    def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        weight = self.detail.expand(len(warped), *self.detail.shape[1:])
+        value, derivative = self.inner.evaluate(warped * _GAIN, weight if mask is None else mask * weight)
+        return value, derivative * _GAIN

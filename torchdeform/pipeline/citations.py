@@ -1,0 +1,49 @@
+"""Which publications the methods of a registration come from, as BibTeX."""
+
+import re
+from pathlib import Path
+
+from torchdeform import __version__
+from torchdeform.metrics.similarity import similarity_weights
+from torchdeform.registration.settings import RegistrationSettings
+
+# What every registration uses, and what some settings add; the keys are those of references.bib.
+_ALWAYS = {"torchdeform": "the software", "liu2007reconstruction": "the method", "liu2024finite": "what a fold is"}
+_SIMILARITIES = {
+    "lncc": ("avants2008symmetric",),
+    "mi": ("viola1997alignment", "thevenaz2000optimization"),
+    "nmi": ("studholme1999overlap",),
+    "ngf": ("haber2006intensity",),
+    "mind": ("heinrich2013towards",),
+}
+_DISCRETE = ("steinbruecker2009large", "siebert2021fast", "heinrich2013towards")
+
+
+def citations(settings: RegistrationSettings) -> dict[str, str]:
+    """Return the keys in `bibliography` of what a registration with these settings uses, each with what for.
+
+    Args:
+        settings: of the registration.
+
+    Notes:
+        Measures that are common property (``ssd``, ``ncc``) have no entry.
+    """
+    found = dict(_ALWAYS)
+    for name in similarity_weights(settings.similarity):
+        found |= dict.fromkeys(_SIMILARITIES.get(name, ()), f"similarity: {name}")
+    if settings.start == "discrete":
+        found |= {key: f"{found[key]}, start: discrete" if key in found else "start: discrete" for key in _DISCRETE}
+    return found
+
+
+def bibliography() -> dict[str, str]:
+    """Return all entries of ``references.bib`` as BibTeX, by key."""
+    text = (Path(__file__).parent / "references.bib").read_text(encoding="utf-8").replace("VERSION", __version__)
+    entries = [entry.strip() for entry in re.split(r"^(?=@)", text, flags=re.MULTILINE) if entry.strip()]
+    return {entry.partition("{")[2].partition(",")[0]: entry for entry in entries}
+
+
+def bibtex(settings: RegistrationSettings) -> str:
+    """Return what to cite for a registration with these settings, as BibTeX with comments that say what for."""
+    entries = bibliography()
+    return "\n\n".join(f"% {use}\n{entries[key]}" for key, use in citations(settings).items())

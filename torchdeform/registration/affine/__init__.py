@@ -1,0 +1,1 @@
+"""The alignment that comes first: maps of the affine group."""

@@ -1,0 +1,264 @@
+"""The coarse search of an alignment: all starts tried, the best climbed, mirror images looked at."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchdeform.core.grid import threads_worth
+from torchdeform.registration.affine.bfgs import climb
+from torchdeform.registration.affine.lie import angle, generators, homogeneous, rotations
+from torchdeform.registration.affine.objective import Frame, Level, Masked
+
+
+@dataclass(frozen=True)
+class Start:
+    """A map to start from.
+
+    Attributes:
+        name: where it comes from.
+        map: matrix ``(D + 1, D + 1)`` in the coordinates of the `Frame`.
+        turned: whether it is more than a shift and a scale.
+    """
+
+    name: str
+    map: Tensor
+    turned: bool
+
+
+# Starts that are climbed, mirrored ones among them, and those that go on to the next level.
+_CLIMBED = 10
+
+
+_MIRRORED = 3
+
+
+_KEPT = 3
+
+
+# Maps nearer to each other than this (norm of the difference of their matrices) count as one.
+_SAME_START = 0.3
+
+
+_SAME_END = 0.05
+
+
+# Voxels of the coarsest level within which a summit is found here; it is climbed again.
+_NEAR = 0.05
+
+
+# A map that turns further than this many degrees has to be better than the others by this share.
+_TURNED = 45.0
+
+
+_TURNED_GAIN = 1.1
+
+
+# A mirror image has to be better by this share before it is mentioned.
+_MIRROR_GAIN = 1.2
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A map on its way to the alignment.
+
+    Attributes:
+        name: the start it comes from.
+        map: matrix ``(D + 1, D + 1)`` in the coordinates of the `Frame`.
+        value: its similarity on the last level.
+    """
+
+    name: str
+    map: Tensor
+    value: float
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the coarse search found.
+
+    Attributes:
+        candidates: the best maps, the best first.
+        mirror: how much better a mirrored map is than the best one, in its distance from what chance gives; 1 is
+            equally good.
+    """
+
+    candidates: list[Candidate]
+    mirror: float = 0.0
+
+    @property
+    def size(self) -> float:
+        """How much larger things are in the moving image, by the best map; 1 without one."""
+        if not self.candidates:
+            return 1.0
+        linear = self.candidates[0].map[:-1, :-1]
+        return float(torch.linalg.det(linear)) ** (1 / len(linear))
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether a mirrored map is clearly better."""
+        return self.mirror > _MIRROR_GAIN
+
+
+def climbed(
+    level: Level, candidates: Sequence[Candidate], moves: Tensor, steps: int, shortest: float
+) -> list[Candidate]:
+    """Return the candidates after climbing a level, the most similar first."""
+    starts = torch.stack([c.map for c in candidates])
+    with threads_worth(len(candidates) * level.fields, level.fixed.image.grid):
+        maps, values = climb(level, starts, moves, steps=steps, shortest=shortest)
+    moved = [Candidate(c.name, m, float(v)) for c, m, v in zip(candidates, maps, values, strict=True)]
+    return sorted(moved, key=lambda c: -c.value)
+
+
+def search(level: Level, kind: str, *, turn: bool, steps: int) -> Found:
+    """Return the best maps that starts at the files' geometry, the centres, the moments and rotations lead to.
+
+    Args:
+        level: the coarsest level.
+        kind: ``translation`` to ``affine``; ``affine`` is searched as ``similarity``.
+        turn: try rotations, and mirror images.
+        steps: evaluations at most.
+
+    Notes:
+        Merit is (S − median of S over all starts) · overlap: what is common to bad maps does not count, and a little
+        overlap is worth little. A map that turns by more than 45° is taken only when its merit is 1.1 times that of
+        all that turn less.
+    """
+    rough = "similarity" if kind == "affine" else kind
+    bodies = body(level.fixed, level.frame), body(level.moving, level.frame)
+    plain, chance = _try(level, make_starts(*bodies, turn=turn, scale=rough == "similarity"), rough, steps, _CLIMBED)
+    if not turn or not plain:
+        return Found(_best(plain, chance))
+    flipped = make_starts(*bodies, turn=True, scale=rough == "similarity", mirror=True)
+    mirrored, _ = _try(level, flipped, rough, steps, _MIRRORED)
+    tops = [max((c.value - chance for c in side), default=0.0) for side in (mirrored, plain)]
+    return Found(_best(plain, chance), tops[0] / max(tops[1], 1e-12))
+
+
+def _try(level: Level, starts: list[Start], kind: str, steps: int, most: int) -> tuple[list[Candidate], float]:
+    """Return where the most promising starts lead, their merit as value plus what chance gives, and that."""
+    maps = torch.stack([start.map for start in starts])
+    value, shared = level.values(maps)
+    finite = value.isfinite()
+    if not bool(finite.any()):
+        return [], 0.0
+    chance = float(value[finite].median())
+    merit = (value - chance) * shared.clamp(max=1.0)
+    chosen = [Candidate(starts[i].name, maps[i], 0.0) for i in _promising(starts, maps, merit, most)]
+    ends = climbed(level, chosen, generators(kind, level.dim), steps, _NEAR)
+    value, shared = level.values(torch.stack([c.map for c in ends]))
+    merit = chance + (value - chance) * shared.clamp(max=1.0)
+    return [replace(c, value=float(m)) for c, m in zip(ends, merit, strict=True)], chance
+
+
+def _promising(starts: list[Start], maps: Tensor, merit: Tensor, most: int) -> list[int]:
+    """Return the starts to climb: all without a rotation, then the best of the others that are not alike."""
+    chosen = [i for i, start in enumerate(starts) if not start.turned and merit[i] > -torch.inf]
+    for i in merit.argsort(descending=True, stable=True).tolist():
+        alone = all(float((maps[i] - maps[j]).norm()) >= _SAME_START for j in chosen)
+        if alone and merit[i] > -torch.inf and len(chosen) < most:
+            chosen.append(i)
+    return chosen
+
+
+def _best(candidates: list[Candidate], chance: float) -> list[Candidate]:
+    """Return a few candidates that differ, by merit, which counts for less where a map turns far."""
+
+    def merit(candidate: Candidate) -> float:
+        gain = candidate.value - chance
+        return gain / _TURNED_GAIN if float(angle(candidate.map[:-1, :-1])) > _TURNED else gain
+
+    kept: list[Candidate] = []
+    for candidate in sorted(candidates, key=merit, reverse=True):
+        alone = all(float((candidate.map - other.map).norm()) >= _SAME_END for other in kept)
+        if alone and candidate.value > -torch.inf and len(kept) < _KEPT:
+            kept.append(candidate)
+    return kept
+
+
+# A ratio of sizes nearer to 1 than this is no reason to start with another scale.
+_SAME_SIZE = 1.1
+
+
+@dataclass(frozen=True)
+class Body:
+    """Where an image's content lies in the frame.
+
+    Attributes:
+        mass: centre of what is not background ``(D,)``.
+        covariance: its second moments about that centre ``(D, D)``.
+        box: centre of the image's box ``(D,)``.
+    """
+
+    mass: Tensor
+    covariance: Tensor
+    box: Tensor
+
+
+def body(part: Masked, frame: Frame) -> Body:
+    """Return the moments of |image − background|, or of the mask where there is one.
+
+    Args:
+        part: one or more channels; the background is the median over the faces of the box.
+        frame: coordinates of the result.
+    """
+    grid = part.image.grid
+    weight = _foreground(part.image.data) if part.weight is None else part.weight
+    weight = weight.double().flatten().cpu()
+    weight = weight / weight.sum()
+    points = frame.from_world(part.image.to_world(grid.points(dtype=torch.float64)).flatten(2))[0]
+    mass = points @ weight
+    away = points - mass.unsqueeze(1)
+    return Body(mass, (away * weight) @ away.T, (points[:, 0] + points[:, -1]) / 2)
+
+
+def _foreground(data: Tensor) -> Tensor:
+    axes = range(2, data.dim())
+    faces = torch.cat([data.select(a, end).flatten(1) for a, end in itertools.product(axes, (0, -1))], dim=1)
+    return (data - faces.median()).abs().mean(dim=1) + 1e-6
+
+
+def make_starts(fixed: Body, moving: Body, *, turn: bool, scale: bool, mirror: bool = False) -> list[Start]:
+    """Return the maps to try, those without a rotation first.
+
+    Args:
+        fixed: moments of the fixed image.
+        moving: moments of the moving image, in the same frame.
+        turn: try rotations about each centre, and the principal axes.
+        scale: try the ratio of sizes.
+        mirror: return mirror images of the same maps, which no alignment may end at.
+    """
+    ratio = float((moving.covariance.trace() / fixed.covariance.trace()).sqrt())
+    sizes = [1.0, ratio] if scale and max(ratio, 1 / ratio) > _SAME_SIZE else [1.0]
+    anchors = {
+        "geometry": (fixed.box, fixed.box),
+        "centres": (fixed.box, moving.box),
+        "mass": (fixed.mass, moving.mass),
+    }
+    turns = rotations(len(fixed.box)) if turn else rotations(len(fixed.box))[:1]
+    flip = torch.ones(len(fixed.box), dtype=torch.float64)
+    flip[0] = -1.0 if mirror else 1.0
+    found = []
+    for (name, (start, end)), size, r in itertools.product(anchors.items(), sizes, turns):
+        found.append(_about(name, size * r * flip, start, end))
+    if turn:
+        found += [_about("moments", r * flip, fixed.mass, moving.mass) for r in _axes(fixed, moving)]
+    return sorted(found, key=lambda s: s.turned)
+
+
+def _about(name: str, linear: Tensor, start: Tensor, end: Tensor) -> Start:
+    degrees = float(angle(linear)) if torch.linalg.det(linear) > 0 else 180.0
+    turned = degrees > 1.0
+    full = f"{name}, turned by {degrees:.0f}°" if turned else name
+    return Start(full, homogeneous(linear, end - linear @ start), turned)
+
+
+def _axes(fixed: Body, moving: Body) -> list[Tensor]:
+    """Return the rotations that take principal axes to principal axes: 2 in 2D, 4 in 3D."""
+    frames = [torch.linalg.eigh(b.covariance).eigenvectors for b in (fixed, moving)]
+    signs = itertools.product((1.0, -1.0), repeat=len(fixed.box))
+    every = [frames[1] @ torch.diag(torch.tensor(s, dtype=torch.float64)) @ frames[0].T for s in signs]
+    return [r for r in every if torch.linalg.det(r) > 0]

@@ -1,0 +1,249 @@
+"""What is registered, on one grid: the images as they are compared, where they count, which points belong together."""
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image, require_registrable, resample, same_place
+from torchdeform.core.intensities import corresponding_channels, fill, to_common_scale
+from torchdeform.core.resampling import restrict
+from torchdeform.core.transform import Affine
+from torchdeform.errors import InputError
+from torchdeform.metrics.similarity import on_one_scale
+from torchdeform.registration.settings import RegistrationSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Guidance:
+    """Masks, landmarks and labels; for tensors they are tensors, for images masks and labels are `Image`s.
+
+    Args:
+        fixed_mask: where the fixed image counts: weights from 0 to 1 ``(B or 1, 1, *S)``, or an `Image` whose values
+            other than 0 mean yes. What lies where the mask is 0 has no influence, and may be NaN.
+        moving_mask: where the moving image counts, likewise; it moves with the image.
+        fixed_points: landmarks ``(B, D, n)``: for tensors in array order in units of spacing, node 0 at the origin; for
+            images in the world, (x, y, z) in mm.
+        moving_points: the same landmarks in the moving image, in the same order.
+        fixed_labels: whole numbers ``(B, 1, *S)``, 0 for what is not looked at; or an `Image` of them.
+        moving_labels: likewise of the moving image. Labels are only measured.
+
+    Raises:
+        InputError: points or labels of one image only, or points whose shapes do not fit or that are not finite.
+    """
+
+    fixed_mask: Tensor | Image | None = None
+    moving_mask: Tensor | Image | None = None
+    fixed_points: Tensor | None = None
+    moving_points: Tensor | None = None
+    fixed_labels: Tensor | Image | None = None
+    moving_labels: Tensor | Image | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("points", "labels"):
+            given = [getattr(self, f"{side}_{name}") is not None for side in ("fixed", "moving")]
+            if given[0] != given[1]:
+                missing = "fixed" if given[1] else "moving"
+                raise InputError(f"{missing}_{name} are missing: give {name} of both images, or of none")
+        if self.fixed_points is not None and self.moving_points is not None:
+            _require_pairs(self.fixed_points, self.moving_points)
+
+    def to(self, device: torch.device | str) -> "Guidance":
+        """Return the same with everything on ``device``."""
+        parts = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Guidance(**{name: None if part is None else part.to(device) for name, part in parts.items()})
+
+    @property
+    def labels(self) -> tuple[Any, Any] | None:
+        """The labels of both images, None without."""
+        return None if self.fixed_labels is None else (self.fixed_labels, self.moving_labels)
+
+    @property
+    def points(self) -> tuple[Tensor, Tensor] | None:
+        """The landmarks of both images, None without."""
+        first, second = self.fixed_points, self.moving_points
+        return None if first is None or second is None else (first, second)
+
+    def require_tensors(self, grid: Grid, items: int) -> None:
+        """Raise `InputError` unless everything given is a tensor that goes with images ``(items, C, *S)``."""
+        for name in ("fixed_mask", "moving_mask", "fixed_labels", "moving_labels"):
+            field = getattr(self, name)
+            if field is not None:
+                _require_field(field, name, grid, items)
+        if self.fixed_points is not None and tuple(self.fixed_points.shape[:2]) != (items, grid.dim):
+            given = tuple(self.fixed_points.shape)
+            raise InputError(f"fixed_points must have shape ({items}, {grid.dim}, n), got {given}")
+
+    def require_images(self, dim: int) -> None:
+        """Raise `InputError` unless masks and labels are images of ``dim`` axes, and points go with them."""
+        for name in ("fixed_mask", "moving_mask", "fixed_labels", "moving_labels"):
+            field = getattr(self, name)
+            if field is None:
+                continue
+            if not isinstance(field, Image):
+                raise InputError(f"{name} must be an Image, because the images are")
+            if field.grid.dim != dim or field.data.shape[1] != 1:
+                kind = f"{field.grid.dim}D with {field.data.shape[1]} channels"
+                raise InputError(f"{name}: {field.name} must be {dim}D with one channel, but is {kind}; choose another")
+        if self.fixed_points is not None and tuple(self.fixed_points.shape[:2]) != (1, dim):
+            raise InputError(f"fixed_points must have shape (1, {dim}, n), got {tuple(self.fixed_points.shape)}")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Two images on one grid and what is known about them.
+
+    Attributes:
+        grid: their grid.
+        fixed: ``(B, C, *S)``.
+        moving: the same shape.
+        fixed_mask: weights ``(B, 1, *S)``, or None.
+        moving_mask: likewise.
+        fixed_points: ``(B, D, n)`` in grid points, or None.
+        moving_points: likewise.
+    """
+
+    grid: Grid
+    fixed: Tensor
+    moving: Tensor
+    fixed_mask: Tensor | None = None
+    moving_mask: Tensor | None = None
+    fixed_points: Tensor | None = None
+    moving_points: Tensor | None = None
+
+    def on(self, coarse: Grid) -> "Scene":
+        """Return the scene on a coarser grid of the same box."""
+
+        def coarser(field: Tensor | None) -> Tensor | None:
+            return None if field is None else restrict(field, self.grid, coarse)
+
+        masks = {"fixed_mask": coarser(self.fixed_mask), "moving_mask": coarser(self.moving_mask)}
+        images = {"fixed": restrict(self.fixed, self.grid, coarse), "moving": restrict(self.moving, self.grid, coarse)}
+        return replace(self, grid=coarse, **images, **masks)
+
+    def scaled(self, settings: RegistrationSettings) -> "Scene":
+        """Return the scene with intensities on the scale that the similarity needs."""
+        images = to_common_scale(
+            (self.fixed, self.moving),
+            (self.fixed_mask, self.moving_mask),
+            jointly=on_one_scale(settings.similarity),
+        )
+        return replace(self, fixed=images[0], moving=images[1])
+
+
+def tensor_scene(fixed: Tensor, moving: Tensor, grid: Grid, guidance: Guidance) -> Scene:
+    """Return the scene of two tensors on one grid, filled in where the masks are 0."""
+    masks = [_weights(mask, fixed) for mask in (guidance.fixed_mask, guidance.moving_mask)]
+    images = [image if mask is None else fill(image, mask) for image, mask in zip((fixed, moving), masks, strict=True)]
+    points = [None if p is None else p.to(fixed) for p in (guidance.fixed_points, guidance.moving_points)]
+    return Scene(grid, *images, *masks, *points)
+
+
+def _weights(mask: object, like: Tensor) -> Tensor | None:
+    return mask.to(like).expand(like.shape[0], -1, *like.shape[2:]) if isinstance(mask, Tensor) else None
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One of the two images as it is compared, in its own place.
+
+    Attributes:
+        image: channels that are compared, filled in where the mask is 0.
+        mask: 0 and 1 on the image's grid, or None.
+        points: landmarks in the world ``(1, D, n)``, float64, or None.
+    """
+
+    image: Image
+    mask: Image | None
+    points: Tensor | None
+
+    def moved(self, affine: Affine) -> "Subject":
+        """Return the subject at the place where an affine map of the world takes it."""
+        mask = None if self.mask is None else moved(self.mask, affine)
+        points = None if self.points is None else affine(self.points)
+        return Subject(moved(self.image, affine), mask, points)
+
+
+def moved(image: Image, affine: Affine) -> Image:
+    """Return the image at the place where an affine map of the world takes it, pixel by pixel the same."""
+    corner = image.to_world(torch.zeros(1, image.grid.dim, 1, dtype=torch.float64))
+    direction = affine.matrix.double().cpu() @ torch.tensor(image.direction, dtype=torch.float64)
+    return replace(
+        image,
+        origin=tuple(affine(corner).flatten().tolist()),
+        direction=tuple(tuple(row) for row in direction.tolist()),
+    )
+
+
+def subjects(fixed: Image, moving: Image, guidance: Guidance) -> tuple[Subject, Subject]:
+    """Return both images as they are compared.
+
+    Raises:
+        InputError: channels that do not correspond, masks that are empty, pixels that count but are NaN or all equal.
+    """
+    images = corresponding_channels(fixed, moving)
+    first = _subject(images[0], guidance.fixed_mask, guidance.fixed_points)
+    return first, _subject(images[1], guidance.moving_mask, guidance.moving_points)
+
+
+def _subject(image: Image, mask: Tensor | Image | None, points: Tensor | None) -> Subject:
+    points = None if points is None else points.double().to(image.data.device)
+    if not isinstance(mask, Image):
+        require_registrable(image)
+        return Subject(image, None, points)
+    inside = resample(replace(mask, data=(mask.data != 0).to(image.data)), image, mode="nearest")
+    require_mask(inside, mask.name)
+    image = replace(image, data=fill(image.data, inside))
+    require_registrable(image)
+    return Subject(image, replace(image, data=inside), points)
+
+
+def place(fixed: Subject, moving: Subject, frame: Image) -> Scene:
+    """Return the scene of both images sampled on the grid of ``frame``, each where it is in the world.
+
+    An image that does not cover the frame has a mask there whether it came with one or not: beyond its edges there is
+    nothing to compare.
+    """
+    like = fixed.image.data
+    images = [resample(s.image, frame, outside=None).to(like) for s in (fixed, moving)]
+    masks = [_mask_on(frame, s) for s in (fixed, moving)]
+    points = [None if s.points is None else frame.to_grid(s.points).to(like) for s in (fixed, moving)]
+    return Scene(frame.grid, *images, *(None if mask is None else mask.to(like) for mask in masks), *points)
+
+
+def _mask_on(frame: Image, subject: Subject) -> Tensor | None:
+    """Return the weights of a subject on the frame, None if they are 1 everywhere."""
+    image, mask = subject.image, subject.mask
+    if mask is None and same_place(image, frame):
+        return None
+    mask = replace(image, data=torch.ones_like(image.data[:, :1])) if mask is None else mask
+    weights = resample(mask, frame)
+    return None if bool((weights == 1).all()) else weights
+
+
+def _require_pairs(fixed: Tensor, moving: Tensor) -> None:
+    if fixed.dim() != 3 or fixed.shape != moving.shape or fixed.shape[2] == 0:
+        shapes = f"{tuple(fixed.shape)} and {tuple(moving.shape)}"
+        raise InputError(f"fixed_points and moving_points must both have shape (B, D, n), n at least 1, got {shapes}")
+    if not bool(fixed.isfinite().all() and moving.isfinite().all()):
+        raise InputError("fixed_points and moving_points must be finite; leave out pairs that are not known")
+
+
+def _require_field(field: Tensor | Image, name: str, grid: Grid, items: int) -> None:
+    if not isinstance(field, Tensor):
+        raise InputError(f"{name} must be a tensor, because the images are")
+    if tuple(field.shape) not in {(count, 1, *grid.shape) for count in (1, items)}:
+        raise InputError(f"{name} must have shape {(items, 1, *grid.shape)}, got {tuple(field.shape)}")
+    if name.endswith("mask"):
+        require_mask(field, name)
+
+
+def require_mask(mask: Tensor, name: str) -> None:
+    """Raise `InputError` unless the weights lie between 0 and 1, and every item has one that is positive."""
+    values = mask.to(torch.float32) if mask.dtype == torch.bool else mask
+    if not bool(((values >= 0) & (values <= 1)).all()):
+        raise InputError(f"{name} must hold weights from 0 to 1; make it one with mask > 0")
+    if not bool((values > 0).flatten(1).any(1).all()):
+        raise InputError(f"{name} is 0 everywhere, so there is nothing to register; check that it is the right one")

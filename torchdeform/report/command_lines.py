@@ -1,0 +1,51 @@
+"""The commands that repeat a registration and that apply it."""
+
+import json
+import shlex
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+
+from torchdeform.core.interpolation import LABEL_MODE
+from torchdeform.registration.settings import RegistrationSettings
+
+
+def repeat_command(
+    inputs: Mapping[str, str], settings: RegistrationSettings, device: str, memory: int | None = None
+) -> str:
+    """Return the ``register`` line that gives the same result again.
+
+    Args:
+        inputs: files and folder by the name of their option (``fixed``, ``moving``, ``out``, ``fixed_mask``, ...).
+        settings: all of them; those that differ from the preset ``default`` are named.
+        device: ``cpu`` or ``cuda``.
+        memory: bytes to take at most, if there was a limit.
+    """
+    words = ["register", inputs["fixed"], inputs["moving"]]
+    for name, path in inputs.items():
+        if name not in ("fixed", "moving"):
+            words += [f"--{name.replace('_', '-')}", path]
+    for key, value in changed(settings).items():
+        words += ["--set", f"{key}={json.dumps(value)}"]
+    words += ["--device", device]
+    words += [] if memory is None else ["--memory", f"{memory}B"]
+    return shlex.join(words)
+
+
+def changed(settings: RegistrationSettings) -> dict[str, object]:
+    """Return the settings that differ from the defaults."""
+    names, usual = (field.name for field in fields(settings)), RegistrationSettings()
+    return {name: getattr(settings, name) for name in names if getattr(settings, name) != getattr(usual, name)}
+
+
+def apply_commands(inputs: Mapping[str, str], out: Path) -> dict[str, str]:
+    """Return lines that use the result on other files, by what they do."""
+    there, back = (str(out / name) for name in ("transform.h5", "inverse.h5"))
+    onto = ("--reference", inputs["fixed"])
+    verbs = {
+        "another image of the moving space, onto the fixed grid": ("apply", there, "IMAGE", *onto),
+        "labels of the moving space": ("apply", there, "LABELS", *onto, "--interpolation", LABEL_MODE),
+        "points of the fixed space, to the moving space": ("points", there, "POINTS"),
+        "points of the moving space, to the fixed space": ("points", back, "POINTS"),
+    }
+    return {what: shlex.join(("torchdeform", *words, "--out", "FILE")) for what, words in verbs.items()}

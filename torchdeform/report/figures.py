@@ -1,0 +1,247 @@
+"""``overview.png``: one look that tells whether a registration went well."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image, luminance
+from torchdeform.core.warp import sample
+from torchdeform.report.drawing import (
+    INK,
+    PAPER,
+    difference_scale,
+    draw_convergence,
+    draw_faint,
+    draw_image,
+    draw_lines,
+    draw_map,
+    frame,
+    measure_name,
+    tinted,
+    volume_scale,
+)
+from torchdeform.report.planes import Plane, planes_of
+from torchdeform.report.report_data import Scene, Slices, to_unit
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from torchdeform.registration.result import RegistrationResult
+
+_SHEET = {2: (2, 4), 3: (3, 7)}  # rows and columns of panels
+_PANEL_INCHES = {2: 3.2, 3: 2.3}
+_GRID_LINES = {2: 36, 3: 24}
+
+Draw = Callable[["Axes", Scene, Slices], None]
+
+
+def write_overview(path: Path, scene: Scene) -> None:
+    """Draw a registration as a PNG: images, differences, the deformed grid and log J; in 3D three middle planes.
+
+    Args:
+        path: the file to write.
+        scene: what `make_scene` returns.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    result, dim = scene.result, scene.result.grid.dim
+    rows, columns = _SHEET[dim]
+    width = _PANEL_INCHES[dim]
+    shapes = [cuts.plane.height_over_width for cuts in scene.slices]
+    heights = [width * min(2.0, max(0.4, shape)) for shape in shapes] * (rows // len(shapes))
+    figure = Figure((columns * width, sum(heights) + 0.3 * rows + 0.4), dpi=110, layout="constrained", facecolor=PAPER)
+    cells = figure.subplots(rows, columns, squeeze=False, height_ratios=heights).flat
+    for cuts, (title, draw) in product(scene.slices, _PANELS.items()):
+        axes = next(cells)
+        draw(axes, scene, cuts)
+        axes.set_title(_title(title, result) if cuts is scene.slices[0] else "", fontsize=10, color=INK)
+    for axes in cells:
+        draw_convergence(axes, result)
+        axes.set_title(f"{measure_name(result)} over the steps", fontsize=10, color=INK)
+        axes.set_ylabel("")
+        axes.set_box_aspect(shapes[0])
+    figure.suptitle(_headline(result), fontsize=11, color=INK)
+    FigureCanvasAgg(figure).print_png(str(path))
+
+
+def _title(panel: str, result: "RegistrationResult") -> str:
+    """Return the title of a panel; the moving image is shown where the alignment has taken it."""
+    return f"{panel}, aligned" if panel == "moving" and result.affine is not None else panel
+
+
+def _headline(result: "RegistrationResult") -> str:
+    diagnosis = result.diagnosis
+    before, after = result.similarity_before.item(), result.similarity_after.item()
+    return (
+        f"{measure_name(result)} {before:.3g} → {after:.3g}     "
+        f"folds {int(diagnosis.folds.item())}     "
+        f"determinant {diagnosis.det_min.item():.2g} to {diagnosis.det_max.item():.2g}     "
+        f"inverse error {result.inverse_error_mean.item():.2g} voxel"
+    )
+
+
+def _draw_image(name: str) -> Draw:
+    def draw(axes: "Axes", scene: Scene, cuts: Slices) -> None:
+        draw_image(axes, cuts.plane, cuts.fields[name][cuts.middle])
+
+    return draw
+
+
+def _draw_difference(name: str) -> Draw:
+    def draw(axes: "Axes", scene: Scene, cuts: Slices) -> None:
+        draw_map(axes, cuts.plane, cuts.fields[name][cuts.middle], difference_scale(scene.limits[name]), bar=False)
+
+    return draw
+
+
+def _draw_grid(axes: "Axes", scene: Scene, cuts: Slices) -> None:
+    """Draw where φ takes the lines of a regular grid, over the moving image it takes them to."""
+    draw_faint(axes, cuts.plane, cuts.fields["moving"][cuts.middle])
+    draw_lines(axes, cuts.plane, cuts.fields["u"][cuts.middle], _GRID_LINES[cuts.plane.grid.dim])
+
+
+def _draw_volume(axes: "Axes", scene: Scene, cuts: Slices) -> None:
+    draw_map(axes, cuts.plane, cuts.fields["log_det"][cuts.middle], volume_scale(scene.limits["log_det"]))
+
+
+_PANELS: dict[str, Draw] = {
+    "fixed": _draw_image("fixed"),
+    "moving": _draw_image("moving"),
+    "warped": _draw_image("warped"),
+    "grid moved by the map": _draw_grid,
+    "difference before": _draw_difference("before"),
+    "difference after": _draw_difference("after"),
+    "volume: moving / fixed": _draw_volume,
+}
+
+
+_INCHES = {2: 3.2, 3: 2.2}  # width of a panel
+_PERCENTILES = (0.005, 0.995)
+
+
+def write_gallery(path: Path, images: Mapping[str, Image]) -> None:
+    """Draw images side by side as a PNG, each by its own grey values; in 3D their three middle planes.
+
+    Args:
+        path: the file to write.
+        images: by title, all of one dimension.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    sheet = [planes_of(image) for image in images.values()]
+    width = _INCHES[next(iter(images.values())).grid.dim]
+    heights = [width * max(plane.height_over_width for plane in row) for row in zip(*sheet, strict=True)]
+    size = (width * len(images), sum(heights) + 0.3)
+    figure = Figure(size, dpi=110, layout="constrained", facecolor=PAPER)
+    cells = figure.subplots(len(heights), len(images), squeeze=False, height_ratios=heights)
+    for column, ((title, image), planes) in enumerate(zip(images.items(), sheet, strict=True)):
+        grey = _grey(image)
+        for row, plane in enumerate(planes):
+            draw_image(cells[row, column], plane, plane.cut(grey.data, [plane.middle])[0])
+        cells[0, column].set_title(title, fontsize=10, color=INK)
+    FigureCanvasAgg(figure).print_png(str(path))
+
+
+def _grey(image: Image) -> Image:
+    """Return an image as grey values from 0 to 1."""
+    grey = luminance(image).data.float().cpu()
+    values = grey.flatten().sort().values
+    low, high = (values[round(share * (len(values) - 1))] for share in _PERCENTILES)
+    return replace(image, data=((grey - low) / (high - low).clamp(min=1e-12)).clamp(0, 1))
+
+
+_OUTLINES = ("#0b5fa5", "#b34700")
+_OVERLAY_INCHES = 3.0
+_PIXELS = 400  # along the longer side of a picture
+_FARTHEST = 3.0  # the picture is at most so many times as wide as the fixed image
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """A plane of the canvas: grey values from 0 to 1 of both images ``(h, w)``, and where each of them is."""
+
+    plane: Plane
+    values: tuple[NDArray[np.float32], NDArray[np.float32]]
+    inside: tuple[NDArray[np.bool_], NDArray[np.bool_]]
+
+
+def write_overlay(path: Path, fixed: Image, moving: Image) -> None:
+    """Draw both images and their overlay as a PNG: fixed in blue, moving in orange, white where both are bright.
+
+    Args:
+        path: the file to write.
+        fixed: fixed image; the planes are its middle ones, three in 3D.
+        moving: moving image of the same dimension, in its own place.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    cuts = _cuts(fixed, moving)
+    heights = [_OVERLAY_INCHES * min(2.0, max(0.4, cut.plane.height_over_width)) for cut in cuts]
+    size = (3 * _OVERLAY_INCHES, sum(heights) + 0.3 * len(cuts) + 0.5)
+    figure = Figure(size, dpi=110, layout="constrained", facecolor=PAPER)
+    cells = figure.subplots(len(cuts), 3, squeeze=False, height_ratios=heights)
+    for row, cut in zip(cells, cuts, strict=True):
+        _draw_row(row, cut, titled=cut is cuts[0])
+    figure.suptitle("fixed in blue, moving in orange, frames where they end", fontsize=11, color=INK)
+    FigureCanvasAgg(figure).print_png(str(path))
+
+
+def _draw_row(row: "Sequence[Axes]", cut: _Cut, *, titled: bool) -> None:
+    pictures = {"fixed": cut.values[0], "moving": cut.values[1], "overlay": tinted(*cut.values)}
+    for axes, (title, picture) in zip(row, pictures.items(), strict=True):
+        axes.imshow(picture, cmap="gray", vmin=0, vmax=1, aspect=cut.plane.aspect)
+        for inside, colour in zip(cut.inside, _OUTLINES, strict=True):
+            if inside.any() and not inside.all():
+                axes.contour(inside.astype(np.float32), levels=[0.5], colors=[colour], linewidths=0.9)
+        frame(axes, cut.plane)
+        axes.set_title(title if titled else "", fontsize=10, color=INK)
+
+
+def _cuts(fixed: Image, moving: Image) -> list[_Cut]:
+    canvas = _canvas(fixed, moving)
+    return [_cut(plane, canvas, (fixed, moving)) for plane in planes_of(canvas)]
+
+
+def _canvas(fixed: Image, moving: Image) -> Image:
+    """Return an empty image along the fixed one's axes, its middle there, that holds both (unless one is far off)."""
+    corners = fixed.to_grid(moving.to_world(_corners(moving.grid)))[0]
+    middle, width = [side / 2 for side in fixed.grid.extent], []
+    for k, side in enumerate(fixed.grid.extent):
+        reach = max(float((corners[k] - middle[k]).abs().max()), side / 2)
+        width.append(2 * min(reach, _FARTHEST * side / 2) * 1.02)
+    pixel = max(width) / _PIXELS
+    shape = tuple(max(2, round(w / pixel) + 1) for w in width)
+    grid = Grid(shape, tuple(w / (n - 1) for w, n in zip(width, shape, strict=True)))
+    first = torch.tensor([m - w / 2 for m, w in zip(middle, width, strict=True)], dtype=torch.float64)
+    origin = fixed.to_world(first.view(1, -1, 1))[0, :, 0].tolist()
+    return replace(fixed, data=torch.zeros(()).expand(1, 1, *shape), grid=grid, origin=tuple(origin))
+
+
+def _corners(grid: Grid) -> Tensor:
+    return torch.tensor(list(product(*((0.0, side) for side in grid.extent))), dtype=torch.float64).T.unsqueeze(0)
+
+
+def _cut(plane: Plane, canvas: Image, images: tuple[Image, Image]) -> _Cut:
+    """Sample both images in one plane of the canvas; only its points are made."""
+    world = canvas.to_world(plane.points([plane.middle]))
+    found = [_values(image, world, plane) for image in images]
+    return _Cut(plane, (found[0][0], found[1][0]), (found[0][1], found[1][1]))
+
+
+def _values(image: Image, world: Tensor, plane: Plane) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    data = image.data.detach().cpu()
+    grey = to_unit(data[:, :3], data).mean(1, keepdim=True).float()
+    points = image.to_grid(world)
+    flat = plane.arrange(sample(grey, points, image.grid, outside=torch.nan))[0, 0].numpy()
+    return np.nan_to_num(flat), ~np.isnan(flat)
