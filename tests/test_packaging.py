@@ -29,7 +29,13 @@ def test_wheel_holds_what_is_needed(wheel, root):
     presets = {f"torchdeform/configs/presets/{p.name}" for p in (root / "configs" / "presets").iterdir()}
     modules = {str(p.relative_to(root)) for p in (root / "torchdeform").rglob("*.py")}
     templates = {f"torchdeform/report/templates/report.{kind}" for kind in ("html", "css", "js")}
-    assert presets | modules | templates | {"torchdeform/py.typed", "torchdeform/references.bib"} <= names
+    assert (
+        presets
+        | modules
+        | templates
+        | {"torchdeform/py.typed", "torchdeform/__init__.pyi", "torchdeform/pipeline/references.bib"}
+        <= names
+    )
     assert not any(name.startswith(("tests/", "configs/")) for name in names)
 
 
