@@ -1,19 +1,14 @@
 """What alignment alone reaches on real images that nobody prepared. Skipped where the images are absent."""
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
+from pairs import SETS, Pair
 
 from torchdeform.core.image import Image, luminance
 from torchdeform.core.transform import Affine
 from torchdeform.io import read_image
 from torchdeform.io.points import matched, read_points
 from torchdeform.registration.affine.align import Alignment, affine_warp, align
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts" / "benchmarks"))
-from pairs import SETS, Pair
 
 pytestmark = pytest.mark.data
 

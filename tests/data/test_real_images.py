@@ -1,15 +1,12 @@
 """What the library promises on real images: overlap, a sound map, an inverse. Skipped where the images are absent."""
 
-import sys
 from pathlib import Path
 
 import pytest
 import torch
+from registration import SETS, Case, judge
 
 import torchdeform as td
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts" / "benchmarks"))
-from registration import SETS, Case, judge
 
 pytestmark = pytest.mark.data
 

@@ -16,7 +16,7 @@ import torchdeform
 def wheel(tmp_path_factory) -> Path:
     """The wheel, built from the checkout without a network."""
     pytest.importorskip("hatchling")
-    root, out = Path(__file__).resolve().parents[1], tmp_path_factory.mktemp("wheel")
+    root, out = Path(__file__).resolve().parents[2], tmp_path_factory.mktemp("wheel")
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(out)]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""Images and maps with known answers, for the tests of this folder."""
+"""Images and maps with known answers, for tests of registration."""
 
 import math
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
+from memory import QUICK, estimated, measure  # type: ignore[attr-defined]
 
 import torchdeform.pipeline.memory as memory
 from torchdeform.core.grid import Grid
@@ -15,9 +16,6 @@ from torchdeform.core.resampling import MIN_NODES
 from torchdeform.errors import InputError
 from torchdeform.metrics.similarity import SIMILARITIES
 from torchdeform.pipeline.memory import available, estimate, fitting_grid, parse_size, peak, readable
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts" / "benchmarks"))
-from memory import QUICK, estimated, measure  # type: ignore[attr-defined]
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="measured by what Linux tells of a process")
 

@@ -1,26 +1,10 @@
 """The page in a real browser: pictures show, sliders move, keys work, nothing is complained about or asked for."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
+import chromium
 import pytest
 
 from torchdeform.report import write_report
 
-
-def _helper():
-    """The module beside this one that drives a browser."""
-    path = Path(__file__).with_name("chromium.py")
-    spec = importlib.util.spec_from_file_location("chromium", path)
-    assert spec is not None and spec.loader is not None  # noqa: PT018
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-chromium = _helper()
 WIDTH = 1280
 
 

@@ -149,5 +149,5 @@ def test_public_names_are_all_there():
         assert getattr(torchdeform, name).__doc__, name
     assert set(torchdeform.__all__) <= set(dir(torchdeform))
     assert callable(torchdeform.warp)  # not the module of the same name
-    with pytest.raises(AttributeError, match="attribute.*nothing"):
+    with pytest.raises(AttributeError, match=r"attribute.*nothing"):
         _ = torchdeform.nothing
