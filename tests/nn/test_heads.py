@@ -10,7 +10,7 @@ from torchdeform.core.diagnostics import diagnose
 from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.nn import JacobianCurlHead
-from torchdeform.nn.heads import scale_to_bounds, flow_to_monitor, with_mean_one
+from torchdeform.nn.heads import flow_to_monitor, scale_to_bounds, with_mean_one
 
 GRIDS = [Grid((24, 20), (1.0, 1.5)), Grid((12, 10, 14), (1.0, 2.0, 1.0))]
 

@@ -24,7 +24,12 @@ Rate = Callable[[Any, Tensor], Tensor]
 
 
 class Tableau(NamedTuple):
-    """An explicit Runge-Kutta method: k_i = rate(t + c_i h, y + h Σ_j a_ij k_j), y ← y + h Σ_i b_i k_i, c_i = Σ_j a_ij."""
+    """An explicit Runge-Kutta method: k_i = rate(t + c_i h, y + h Σ_j a_ij k_j), y ← y + h Σ_i b_i k_i.
+
+    Attributes:
+        stages: the rows a_i, whose sums are c_i, each as long as there are stages before it.
+        weights: b.
+    """
 
     stages: tuple[tuple[float, ...], ...]
     weights: tuple[float, ...]
@@ -182,7 +187,7 @@ def integrate_rate(
     solver: OdeSolver,
     parameters: Sequence[Tensor] = (),
 ) -> Tensor:
-    """Return the states y(t) at the times, ``(len(times), *start.shape)``, where dy/dt = rate(t, y); nothing is clamped.
+    """Return the states y(t) at the times, ``(len(times), *start.shape)``, where dy/dt = rate(t, y), unclamped.
 
     Arguments and errors are those of `integrate_points`, but the state may be anything ``(B, D, *T)``.
     """

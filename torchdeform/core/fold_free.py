@@ -24,9 +24,7 @@ _WIDEN = {2: F.max_pool2d, 3: F.max_pool3d}
 
 
 @torch.no_grad()
-def largest_share(
-    accept: Callable[[Tensor], Tensor], like: Tensor, *, halvings: int, refine: bool = False
-) -> Tensor:
+def largest_share(accept: Callable[[Tensor], Tensor], like: Tensor, *, halvings: int, refine: bool = False) -> Tensor:
     """Return the largest share t of a move that is accepted, for each item ``(B,)``: 1, or found by halving.
 
     Args:
@@ -59,6 +57,8 @@ def lowest_determinant(u: Tensor, grid: Grid) -> Tensor:
     """
     lowest = one_sided_determinant(u, grid)
     for axis, n in zip(grid.axes, grid.shape, strict=True):
+        if n < 3:
+            continue
         layers = torch.cat([u.narrow(axis, 0, 3), u.narrow(axis, n - 3, 3)])
         first, last = jacobian_determinant(layers, Grid(tuple(layers.shape[2:]), grid.spacing)).chunk(2)
         for node, det in ((0, first), (n - 1, last)):

@@ -18,8 +18,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.flow import OdeSolver, integrate_points
+from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import max_voxels, sample
 from torchdeform.deformation.corrections import correct_determinant

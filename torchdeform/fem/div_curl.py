@@ -160,6 +160,4 @@ def _allow_rounding(system: DivCurlSystem, load: Tensor, found: Solution) -> tup
         return found.status
     floor = 8 * torch.finfo(load.dtype).eps * (system.diagonal(load) * found.value).flatten(1).norm(dim=1)
     fine = (found.residual * system.free(load).flatten(1).norm(dim=1) <= floor).tolist()
-    return tuple(
-        Status.CONVERGED if s is Status.ROUNDING and f else s for s, f in zip(found.status, fine, strict=True)
-    )
+    return tuple(Status.CONVERGED if s is Status.ROUNDING and f else s for s, f in zip(found.status, fine, strict=True))

@@ -58,7 +58,8 @@ class DivCurlSystem:
         forces = tuple(Row(1.0, (Term(1.0, k, None),)) for k in range(self.grid.dim))
         parts = [(form[:1], div), (form[1 : 1 + turns], curl), (forces, force)]
         rows = tuple(row for some, data in parts if data is not None for row in some)
-        load = assemble_load(rows, torch.cat([data for _, data in parts if data is not None], dim=1), self.grid)
+        given = [data for _, data in parts if data is not None]
+        load = assemble_load(rows, torch.cat(given, dim=1) if len(given) > 1 else given[0], self.grid)
         if values is None:
             return load
         return lift(lambda w: self._apply_all(w, self.weights), load, values, self.fixed(load.device))

@@ -12,7 +12,7 @@ from torchdeform.core.grid import Grid, per_item
 from torchdeform.core.resampling import prolong
 from torchdeform.core.warp import invert
 from torchdeform.errors import InputError
-from torchdeform.nn.heads import scale_to_bounds, flow_to_monitor, with_mean_one
+from torchdeform.nn.heads import flow_to_monitor, scale_to_bounds, with_mean_one
 from torchdeform.nn.precision import full_precision
 from torchdeform.nn.spatial import SpatialTransformer
 

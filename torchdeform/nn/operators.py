@@ -46,18 +46,13 @@ def _grid_of(field: Tensor, spacing: Sequence[float]) -> Grid:
     return Grid(tuple(field.shape[2:]), tuple(spacing))
 
 
-def _load(data: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str) -> Tensor:
-    system = DivCurlSystem(_grid_of(data, spacing), Weights(*weights), boundary)
-    return system.load(div=data[:, :1], curl=data[:, 1:])
-
-
 @torch.library.custom_op("torchdeform::div_curl_velocity", mutates_args=())
 def div_curl_velocity(
     data: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str, solver: str = "auto"
 ) -> Tensor:
     """Return v = K⁻¹ A data: the velocity of divergence and curl ``data (B, 1 + C, *S)``, see `DivCurlVelocity`."""
-    factor = _factor(data, spacing, weights, boundary, solver)
-    return factor(_load(data, spacing, weights, boundary))
+    system = DivCurlSystem(_grid_of(data, spacing), Weights(*weights), boundary)
+    return _factor(data, spacing, weights, boundary, solver)(system.load(div=data[:, :1], curl=data[:, 1:]))
 
 
 @torch.library.custom_op("torchdeform::div_curl_adjoint", mutates_args=())
@@ -66,9 +61,13 @@ def div_curl_adjoint(
 ) -> Tensor:
     """Return Aᵀ K⁻¹ slope, ``(B, 1 + C, *S)``: the transpose of `div_curl_velocity`, since K is symmetric."""
     solved = _factor(slope, spacing, weights, boundary, solver)(slope)
-    with torch.enable_grad():
-        data = slope.new_zeros(slope.shape[0], 1 + len(CURL_PAIRS[slope.dim() - 2]), *slope.shape[2:]).requires_grad_()
-        return torch.autograd.grad(_load(data, spacing, weights, boundary), data, solved)[0]
+    system = DivCurlSystem(_grid_of(slope, spacing), Weights(*weights), boundary)
+    found = []
+    for name, channels in (("div", 1), ("curl", len(CURL_PAIRS[system.grid.dim]))):
+        data = slope.new_zeros(slope.shape[0], channels, *slope.shape[2:]).requires_grad_()
+        with torch.enable_grad():
+            found += torch.autograd.grad(system.load(**{name: data}), data, solved)
+    return torch.cat(found, dim=1)
 
 
 @div_curl_velocity.register_fake
@@ -95,9 +94,7 @@ div_curl_adjoint.register_autograd(
 
 
 @torch.library.custom_op("torchdeform::share_within_bounds", mutates_args=())
-def share_within_bounds(
-    u: Tensor, spacing: Sequence[float], min_det: float, max_det: float, max_curl: float
-) -> Tensor:
+def share_within_bounds(u: Tensor, spacing: Sequence[float], min_det: float, max_det: float, max_curl: float) -> Tensor:
     """Return for each item the share t ≤ 1 that leaves φ = id + t u within bounds, ``(B,)``.
 
     Args:
@@ -127,8 +124,8 @@ def share_within_bounds(
     share, beyond = u.new_ones(u.shape[0]), ~within(u)
     if bool(beyond.any()):
         part = u[beyond]
-        found = largest_share(lambda t: within(per_item(t, part) * part), share[beyond], halvings=_HALVINGS, refine=True)
-        share[beyond] = found
+        accept = lambda t: within(per_item(t, part) * part)  # noqa: E731
+        share[beyond] = largest_share(accept, share[beyond], halvings=_HALVINGS, refine=True)
     return share
 
 

@@ -79,9 +79,7 @@ class DivCurlVelocity(nn.Module):
         if curl is not None:
             self.grid.check(curl, "DivCurlVelocity: curl", components=len(CURL_PAIRS[self.grid.dim]))
         data = div if curl is None else torch.cat([div, curl], dim=1)
-        return div_curl_velocity(
-            _whole(data, self.grid), self.grid.spacing, self.weights, self.boundary, self.solver
-        )
+        return div_curl_velocity(_whole(data, self.grid), self.grid.spacing, self.weights, self.boundary, self.solver)
 
     def extra_repr(self) -> str:
         names = ("weight_div", "weight_curl", "weight_zero")
@@ -116,8 +114,8 @@ class FlowIntegrator(nn.Module):
         2·D per node and stage (``rk4`` has 4 stages a step). With ``adjoint`` 5·D are kept however many steps there
         are: the flow is followed backwards in time, which takes about as long again, and the gradient has the error of
         the method.
-        torch.compile and torch.export take all but ``dopri5`` and ``adjoint`` in one graph: traced, the methods of fixed
-        steps run without torchdiffeq, to the same numbers but for rounding.
+        torch.compile and torch.export take all but ``dopri5`` and ``adjoint`` in one graph: traced, the methods of
+        fixed steps run without torchdiffeq, to the same numbers but for rounding.
     """
 
     def __init__(self, grid: Grid, method: str = "squaring", *, steps: int = 7, adjoint: bool = False) -> None:

@@ -110,7 +110,8 @@ class ConjugateGradient:
 
 def _matrix_product(system: System, like: Tensor) -> Callable[..., Tensor]:
     """Return v ↦ K v by the sparse matrix; where a derivative by θ is wanted, by the operator, which equals it."""
-    rows = to_csr(system.matrix(like.device).to(like.dtype))
+    with torch.no_grad():
+        rows = to_csr(system.matrix(like.device).to(like.dtype))
 
     def product(v: Tensor, *parameters: Tensor) -> Tensor:
         if torch.is_grad_enabled() and any(p.requires_grad for p in (v, *parameters)):
