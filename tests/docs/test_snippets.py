@@ -29,7 +29,7 @@ def blocks(page: str, *languages: str) -> list[str]:
 
 
 # Pages whose snippets have a test of their own.
-ELSEWHERE = {"README.md": "tests/test_readme.py", "docs/layers.md": "tests/nn/test_layers_page.py"}
+ELSEWHERE = {"README.md": "tests/docs/test_readme.py", "docs/layers.md": "tests/docs/test_layers_page.py"}
 # What a page takes for granted.
 GIVEN = {
     "docs/templates.md": (

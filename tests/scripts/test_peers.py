@@ -1,18 +1,14 @@
 """The benchmark against other tools: its judgement against SimpleITK and plain numpy, its runs, its table."""
 
 import json
-import sys
 from argparse import Namespace
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
+import peers
 import pytest
 import SimpleITK as sitk
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts" / "benchmarks"))
-import peers
 from judge import folds, landmarks, nearest, overlap
 from pairs import Pair
 from peer_tools import TOOLS, Job, by_displacement

@@ -1,0 +1,145 @@
+"""Plans: jobs with settings and places of their own, problems told, collisions refused, costs, and the verb."""
+
+import json
+import math
+
+import pytest
+
+from torchdeform.cohort.estimate import estimate
+from torchdeform.cohort.plan import description, plan, register_job
+from torchdeform.cohort.schema import read_cohort
+from torchdeform.errors import InputError
+from torchdeform.io import write_image
+from torchdeform.pipeline.config import configs_folder, load_settings
+
+_PATTERN = "pairs: {pattern: {files: 'sub-{subject}_ses-{session}.png', pairing: consecutive, within: [subject]}}\n"
+
+
+_IMAGES = [f"sub-{subject}_ses-{session}.png" for subject in ("a", "b") for session in (1, 2)]
+
+
+def test_jobs_have_everything_resolved(touch, cohort_of, tmp_path):
+    touch(_IMAGES)
+    work = plan(cohort_of(f"preset: fast\nsettings: {{window: 5}}\ndevice: cpu\nmemory: 1GB\n{_PATTERN}"))
+    job = work.jobs[0]
+    assert (len(work.jobs), work.problems, work.out) == (2, (), tmp_path / "results")
+    assert job.files.out == tmp_path / "results" / "sub-a" / "sub-a_from-ses2_to-ses1"
+    assert job.settings == load_settings("fast", overrides={"window": 5})
+    assert (job.device, job.memory, job.submission, job.voxels) == ("cpu", 10**9, None, False)
+    assert job.files.fixed.is_absolute()
+
+
+def test_settings_of_a_pair_are_its_own(touch, cohort_of, tmp_path):
+    touch(["a.png", "b.png"])
+    (tmp_path / "t.csv").write_text("fixed,moving,settings.window\na.png,b.png,7\nb.png,a.png,\n", encoding="utf-8")
+    one, other = plan(cohort_of("settings: {window: 5}\npairs: {table: {file: t.csv}}\n")).jobs
+    assert (one.settings.window, other.settings.window) == (7, 5)
+    (tmp_path / "t.csv").write_text("fixed,moving,settings.windw\na.png,b.png,7\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"t.csv line 2: .*no setting 'windw'; did you mean 'window'"):
+        plan(cohort_of("pairs: {table: {file: t.csv}}\n"))
+
+
+def test_missing_files_are_problems_and_the_rest_is_not(touch, cohort_of, tmp_path):
+    touch(["a.png", "b.png"])
+    rows = [
+        "fixed,moving,fixed_labels,moving_mask",
+        "a.png,b.png,,",
+        "a.png,c.png,,",
+        "b.png,a.png,a.png,",
+        "b.png,b.png,,m",
+    ]
+    (tmp_path / "t.csv").write_text("\n".join(rows), encoding="utf-8")
+    work = plan(cohort_of("pairs: {table: {file: t.csv}}\n"))
+    assert [job.name for job in work.jobs] == ["from-b_to-a"]
+    assert [problem.name for problem in work.problems] == ["from-c_to-a", "from-a_to-b", "from-b_to-b"]
+    sentences = [problem.sentence for problem in work.problems]
+    assert sentences[0] == f"moving {tmp_path / 'c.png'} does not exist; check {tmp_path / 't.csv'} line 3"
+    assert "fixed_labels needs moving_labels too" in sentences[1]
+    assert "moving_mask" in sentences[2]
+
+
+@pytest.mark.parametrize(
+    ("pairs", "sentence"),
+    [
+        (
+            "{fixed: a.png, moving: b.png}, {fixed: x/a.png, moving: y/b.png}",
+            "both be called from-b_to-a; give each its own",
+        ),
+        ("{name: a, fixed: a.png, moving: b.png}, {name: A, fixed: b.png, moving: a.png}", "both be called A"),
+        ("{name: logs, fixed: a.png, moving: b.png}", "cannot be called logs"),
+        ("{name: Summary.csv, fixed: a.png, moving: b.png}", "cannot be called Summary.csv"),
+    ],
+)
+def test_pairs_that_would_write_one_place_are_refused(cohort_of, pairs, sentence):
+    with pytest.raises(InputError, match=sentence):
+        plan(cohort_of(f"pairs: {{list: [{pairs}]}}\n"))
+
+
+def test_parts_that_are_not_named_collide(touch, cohort_of):
+    touch(["sub-1_run-1.png", "sub-1_run-2.png", "t.png"])
+    with pytest.raises(InputError, match="would both be called sub-1"):
+        plan(cohort_of("pairs: {pattern: {files: 'sub-{subject}_*.png', pairing: template, fixed: t.png}}\n"))
+
+
+def test_places_are_all_inside_the_folder(touch, cohort_of, tmp_path):
+    touch(["..a..__.png", "-b.png", "c d.png", "ü;$(x).png", "t/t.tif"])
+    work = plan(cohort_of("pairs: {pattern: {files: '{subject}.png', pairing: template, fixed: t/t.tif}}\n"))
+    assert len(work.jobs) == 3  # hidden files are no images
+    for job in work.jobs:
+        assert job.files.out.parent.parent == tmp_path / "results"
+        assert job.files.out.resolve().is_relative_to(tmp_path / "results")
+
+
+def test_a_selection_keeps_jobs_and_problems(touch, cohort_of):
+    touch([*_IMAGES, "sub-c_ses-1.png"])
+    work = plan(cohort_of(_PATTERN))
+    assert [job.name for job in work.only(["sub-b"]).jobs] == ["sub-b_from-ses2_to-ses1"]
+    assert work.only(["sub-*"]).jobs == work.jobs
+    with pytest.raises(InputError, match="no pair is called 'sub-c'"):
+        work.only(["sub-a", "sub-c"])
+
+
+def test_description_is_that_of_derived_data():
+    assert description()["DatasetType"] == "derivative"
+    assert {"Name", "BIDSVersion", "GeneratedBy"} <= set(description())
+
+
+def test_jobs_of_the_challenge_write_its_files(cohort_of, make_image, tmp_path):
+    for name in ("Set_0001_0000", "Set_0002_0000"):
+        write_image(make_image((12, 11, 10)), tmp_path / f"{name}.nii.gz")
+        (tmp_path / f"{name}.csv").write_text("1,2,3\n4.5,5,6\n", encoding="utf-8")
+    content = {
+        "training": [{"image": f"./{n}.nii.gz", "keypoints": f"./{n}.csv"} for n in ("Set_0001_0000", "Set_0002_0000")],
+        "registration_val": [{"fixed": "./Set_0001_0000.nii.gz", "moving": "./Set_0002_0000.nii.gz"}],
+    }
+    (tmp_path / "d.json").write_text(json.dumps(content), encoding="utf-8")
+    (job,) = plan(cohort_of("layout: learn2reg\nsettings: {steps: [1]}\npairs: {learn2reg: {file: d.json}}\n")).jobs
+    assert job.submission == tmp_path / "results" / "submission" / "disp_0001_0002.nii.gz"
+    assert job.voxels
+    outcome = register_job(job)
+    assert job.submission.exists()
+    assert outcome.record["evaluation"]["before"]["landmark_error_max"] == 0
+    assert len(outcome.record["evaluation"]["before"]["landmark_errors"]) == 2
+
+
+def test_two_submissions_of_one_name_are_refused(touch, cohort_of):
+    touch(["A_0001_0000.nii.gz", "A_0002_0000.nii.gz", "B_0002_0000.nii.gz"])
+    text = ", ".join(f"{{fixed: A_0001_0000.nii.gz, moving: {name}_0002_0000.nii.gz}}" for name in "AB")
+    with pytest.raises(InputError, match=r"both be submitted as disp_0001_0002.nii.gz"):
+        plan(cohort_of(f"layout: learn2reg\npairs: {{list: [{text}]}}\n"))
+    with pytest.raises(InputError, match="must end in _CASE_MODALITY"):
+        plan(cohort_of("layout: learn2reg\npairs: {list: [{fixed: a.png, moving: b.png}]}\n"))
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "count"), [("example", 2), ("mindboggle_2d", 7), ("heart_2d", 12), ("hippocampus_3d", 7)]
+)
+def test_shipped_cohorts_find_their_images(name, count, data_folder, monkeypatch):
+    monkeypatch.setenv("TORCHDEFORM_DATA", str(data_folder))
+    work = plan(read_cohort(configs_folder() / f"cohort_{name}.yaml"))
+    assert (len(work.jobs), work.problems) == (count, ())
+    assert all((job.files.fixed_labels is None) == (name == "example") for job in work.jobs)
+    costs = estimate(work.jobs)
+    assert costs.unknown == 0
+    assert math.isfinite(costs.seconds)

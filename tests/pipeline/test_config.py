@@ -1,0 +1,113 @@
+"""Settings: every way to give them, and every way to give them wrongly."""
+
+from dataclasses import asdict
+
+import pytest
+
+from torchdeform.errors import InputError
+from torchdeform.pipeline.config import (
+    configs_folder,
+    load_settings,
+    parse_override,
+    preset_names,
+    read_yaml,
+    read_yaml_lines,
+)
+from torchdeform.registration.settings import RegistrationSettings
+
+
+def _file(folder, text):
+    path = folder / "settings.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_default_preset_is_the_librarys_default():
+    assert load_settings() == RegistrationSettings()
+
+
+def test_default_preset_shows_every_setting():
+    """The file is also the list of what can be set."""
+    assert set(read_yaml(configs_folder() / "presets" / "default.yaml")) == set(asdict(RegistrationSettings()))
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_presets_load(name):
+    assert isinstance(load_settings(name), RegistrationSettings)
+
+
+def test_later_layers_win(tmp_path):
+    file = _file(tmp_path, "window: 7\nsteps: [5, 5]")
+    settings = load_settings("fast", file, {"steps": [3]})
+    assert (settings.window, settings.steps) == (7, (3,))
+
+
+def test_empty_file_changes_nothing(tmp_path):
+    assert load_settings(file=_file(tmp_path, "# nothing\n")) == RegistrationSettings()
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("3", 3), ("1e-6", "1e-6"), ("[40, 20]", [40, 20]), ("ssd", "ssd"), ("true", True), ("0.5", 0.5)],
+)
+def test_overrides_are_yaml(text, value):
+    assert parse_override(f"some.key={text}") == ("some.key", value)
+
+
+def test_numbers_that_yaml_takes_for_text_are_numbers():
+    assert load_settings(overrides={"window": "7"}).window == 7
+
+
+@pytest.mark.parametrize("text", ["window", "=3", "window=[1"])
+def test_malformed_overrides(text):
+    with pytest.raises(InputError, match="--set"):
+        parse_override(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("windw: 5", r"settings.yaml: there is no setting 'windw'; did you mean 'window'\?"),
+        ("window: abc", r"settings.yaml: window = 'abc'"),
+        ("window: 5.5", r"settings.yaml: window = 5.5"),
+        ("window: 4", "window must be an odd number"),
+        ("similarity: lnc", "similarity"),
+        ("steps: [10, a]", r"steps.1 = 'a'"),
+        ("window: 5\nwindow: 7", r"settings.yaml is no valid YAML at line 2: window is given twice"),
+        ("window: [5", r"settings.yaml is no valid YAML at line 1"),
+        ("- window", "must hold 'key: value' lines"),
+        ("5: window", "must hold 'key: value' lines"),
+        ("window: !!python/object/apply:os.getcwd []", "is no valid YAML"),
+    ],
+)
+def test_wrong_files_are_explained(tmp_path, text, message):
+    with pytest.raises(InputError, match=message):
+        load_settings(file=_file(tmp_path, text))
+
+
+def test_missing_and_unreadable_files(tmp_path):
+    with pytest.raises(InputError, match="No such file"):
+        load_settings(file=tmp_path / "no.yaml")
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(InputError, match=r"binary.yaml is no valid YAML"):
+        load_settings(file=tmp_path / "binary.yaml")
+
+
+def test_unknown_names_get_the_nearest():
+    with pytest.raises(InputError, match="did you mean 'fast'"):
+        load_settings("fst")
+    with pytest.raises(InputError, match=r"window = \{'size': 3\}"):
+        load_settings(overrides={"window.size": 3})
+    with pytest.raises(InputError, match="did you mean 'similarity'"):
+        load_settings(overrides={"similarty": "ssd"})
+
+
+def test_lines_of_keys(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("a: &b\n  c: 1\nd:\n  - e\n  - <<: *b\n    f: 2\n", encoding="utf-8")
+    lines = read_yaml_lines(path)
+    assert lines[("a",)] == 1
+    assert lines[("a", "c")] == 2
+    assert lines[("d", 1)] == 5
+    assert lines[("d", 1, "f")] == 6
+    assert lines[("d", 1, "c")] == 2

@@ -1,0 +1,59 @@
+"""Labels from file to file: what is written is what was measured, every label and its type is kept."""
+
+import json
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+
+from torchdeform.cli.main import main
+from torchdeform.io.labels import read_labels
+
+SHAPES = {2: (40, 44), 3: (16, 18, 20)}
+
+
+def ball(shape: tuple[int, ...], shift: float) -> np.ndarray:
+    """Return the square of the distance from the middle of a box, shifted along the last axis."""
+    nodes = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in shape), indexing="ij"))
+    nodes[-1] -= shift
+    return (nodes**2).sum(0)
+
+
+def regions(shape: tuple[int, ...], shift: float, extra: int) -> np.ndarray:
+    """Return a shell 1 around a core 700, and a corner that only this image has."""
+    distance, size = ball(shape, shift), min(shape)
+    labels = 1.0 * (distance < (0.4 * size) ** 2) + 699.0 * (distance < (0.25 * size) ** 2)
+    labels[(slice(1, 5),) * len(shape)] = extra
+    return labels
+
+
+@pytest.fixture(params=[2, 3])
+def folder(request, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shape = SHAPES[request.param]
+    for name, shift, extra in (("fixed", 0.0, 5), ("moving", 1.3, 9)):
+        image = 200 * np.exp(-ball(shape, shift) / min(shape) ** 2) + 20 * regions(shape, shift, 0) / 700
+        sitk.WriteImage(sitk.GetImageFromArray(image.astype(np.float32)), f"{name}.nrrd")
+        sitk.WriteImage(sitk.GetImageFromArray(regions(shape, shift, extra).astype(np.float32)), f"{name}_labels.nrrd")
+    return tmp_path
+
+
+def test_what_is_written_is_what_was_measured(folder):
+    options = ["--fixed-labels", "fixed_labels.nrrd", "--moving-labels", "moving_labels.nrrd", "--preset", "fast"]
+    assert main(["fixed.nrrd", "moving.nrrd", *options, "--align", "translation", "--out", "out", "--quiet"]) == 0
+    record = json.loads((folder / "out" / "result.json").read_text())
+    assert record["label_interpolation"] == "label"
+    fixed, warped = read_labels("fixed_labels.nrrd").data, read_labels("out/warped_labels.nrrd")
+    assert warped.pixel_type == "float32"
+    assert set(warped.data.unique().tolist()) == {0, 1, 700, 9}
+    found = record["evaluation"]["after"]["dice"]
+    assert set(found) == {"1", "700"}
+    for label, value in found.items():
+        both = [labels == float(label) for labels in (fixed, warped.data)]
+        assert value == pytest.approx(2 * float((both[0] & both[1]).sum()) / float(both[0].sum() + both[1].sum()))
+        assert value > 0.9
+
+
+def test_without_labels_nothing_is_said_of_them(folder):
+    assert main(["fixed.nrrd", "moving.nrrd", "--preset", "fast", "--out", "out", "--quiet"]) == 0
+    assert json.loads((folder / "out" / "result.json").read_text())["label_interpolation"] is None

@@ -1,0 +1,236 @@
+"""Alignment: known maps are found again, in any frame; its derivative against differences; what it refuses."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from affine_pairs import distance, empty, make_pair, make_true, picture, scene, turn
+from torch import Tensor
+
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
+from torchdeform.core.transform import Affine
+from torchdeform.errors import InputError
+from torchdeform.registration.affine.align import AlignmentSettings, affine_warp, align
+from torchdeform.registration.settings import ALIGNMENTS
+
+SHEARED = {dim: torch.eye(dim, dtype=torch.float64).index_put((torch.tensor([0]), torch.tensor([1])), torch.tensor(0.3,
+           dtype=torch.float64)) for dim in (2, 3)}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("dim", "kind", "degrees"),
+    [(2, "rigid", 170), (2, "rigid", -100), (2, "affine", 45), (2, "affine", 170), (3, "rigid", 60), (3, "affine", 40)],
+)
+def test_rotations_are_found(dim, kind, degrees):
+    true = make_true(turn(dim, degrees))
+    fixed, moving = make_pair(true)
+    found = align(fixed, moving, kind)
+    assert distance(found.affine, true, fixed) < 0.1
+    assert found.warnings == ()
+    assert found.similarity_after > found.similarity_before
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_shear_and_rotation_are_found(dim):
+    true = make_true(SHEARED[dim] @ turn(dim, 25))
+    fixed, moving = make_pair(true)
+    assert distance(align(fixed, moving).affine, true, fixed) < 0.1
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.4])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_scales_are_found(dim, scale):
+    true = make_true(scale * turn(dim, 15))
+    fixed, moving = make_pair(true, finer=scale)
+    assert distance(align(fixed, moving, "similarity").affine, true, fixed) < 0.1
+
+
+@pytest.mark.parametrize("kind", ["translation", "rigid"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_shifts_by_half_an_image_are_found(dim, kind):
+    true = make_true(torch.eye(dim, dtype=torch.float64), 45.0, -36.0, 30.0)
+    fixed, moving = make_pair(true, follow=True)
+    assert distance(align(fixed, moving, kind).affine, true, fixed) < 0.1
+
+
+@pytest.mark.parametrize("similarity", ["ssd", "ncc", "mi", "nmi", {"lncc": 1.0, "ncc": 1.0}])
+def test_other_similarities_find_it_too(similarity):
+    true = make_true(turn(2, 20))
+    fixed, moving = make_pair(true)
+    found = align(fixed, moving, "rigid", settings=AlignmentSettings(similarity=similarity))
+    assert distance(found.affine, true, fixed) < 0.5
+
+
+@pytest.mark.parametrize("similarity", ["lncc", "nmi"])
+def test_another_contrast_is_no_obstacle(similarity):
+    true = make_true(turn(2, 20))
+    fixed, moving = make_pair(true)
+    moving = replace(moving, data=500 - moving.data)
+    found = align(fixed, moving, "rigid", settings=AlignmentSettings(similarity=similarity))
+    assert distance(found.affine, true, fixed) < 0.5
+
+
+def reoriented(image: Image) -> Image:
+    """The same image in the same place, its first axis reversed and its first and last axis swapped in the file."""
+    grid, dim = image.grid, image.grid.dim
+    order = [dim - 1, *range(1, dim - 1), 0]
+    end = torch.zeros(1, dim, 1, dtype=torch.float64)
+    end[0, 0, 0] = grid.extent[0]
+    columns = torch.tensor(image.direction, dtype=torch.float64).flip(1)  # in array order
+    columns[:, 0] *= -1
+    columns = columns[:, order].flip(1)
+    data = image.data.flip(2).permute(0, 1, *(2 + a for a in order)).contiguous()
+    shape, spacing = (tuple(v[a] for a in order) for v in (grid.shape, grid.spacing))
+    origin = tuple(image.to_world(end).flatten().tolist())
+    return Image(data, Grid(shape, spacing), origin, tuple(map(tuple, columns.tolist())))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_order_of_axes_in_the_files_does_not_matter(dim):
+    true = make_true(turn(dim, 25))
+    fixed, moving = make_pair(true)
+    world = fixed.to_world(fixed.grid.points(dtype=torch.float64))
+    again = reoriented(fixed)
+    torch.testing.assert_close(scene(again.to_world(again.grid.points(dtype=torch.float64))).float(), again.data)
+    first, second = align(fixed, moving, "rigid"), align(again, reoriented(moving), "rigid")
+    assert (first.affine(world) - second.affine(world)).norm(dim=1).max() < 0.05 * min(fixed.grid.spacing)
+
+
+def test_moving_both_images_in_the_world_moves_the_map_with_them():
+    true = make_true(turn(2, 25))
+    fixed, moving = make_pair(true)
+    away = torch.tensor([1e4, -3e4], dtype=torch.float64)
+    shifted = [replace(i, origin=tuple((torch.tensor(i.origin) + away).tolist())) for i in (fixed, moving)]
+    first, second = align(fixed, moving, "rigid"), align(*shifted, "rigid")
+    expected = Affine(torch.eye(2, dtype=torch.float64), -away).then(first.affine)
+    expected = Affine(expected.matrix, expected.offset + away)
+    assert distance(second.affine, expected, shifted[0]) < 0.05
+
+
+def test_the_same_again_is_the_same_to_the_last_bit():
+    fixed, moving = make_pair(make_true(turn(2, 60)))
+    first, second = align(fixed, moving), align(fixed, moving)
+    assert torch.equal(first.affine.matrix, second.affine.matrix)
+    assert torch.equal(first.affine.offset, second.affine.offset)
+
+
+@pytest.mark.parametrize("kind", ALIGNMENTS)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_each_kind_stays_what_it_is(dim, kind):
+    fixed, moving = make_pair(make_true(SHEARED[dim] @ turn(dim, 20)))
+    found = align(fixed, moving, kind, settings=AlignmentSettings(steps=5))
+    matrix, eye = found.affine.matrix, torch.eye(dim, dtype=torch.float64)
+    assert torch.linalg.det(matrix) > 0
+    gram = matrix @ matrix.T
+    if kind in ("none", "translation"):
+        torch.testing.assert_close(matrix, eye)
+    if kind == "rigid":
+        torch.testing.assert_close(gram, eye, atol=1e-10, rtol=0)
+    if kind == "similarity":
+        torch.testing.assert_close(gram / gram[0, 0], eye, atol=1e-10, rtol=0)
+    if kind == "none":
+        assert not found.affine.offset.any()
+        assert found.similarity_before == found.similarity_after
+
+
+def test_a_mask_keeps_what_moves_differently_out_of_it():
+    """A bright bar lies elsewhere in each image; masks on both sides leave it out."""
+    true = make_true(turn(2, 15))
+    fixed, moving = make_pair(true)
+    pair, masks = [], []
+    for image, rows in ((fixed, slice(0, 12)), (moving, slice(60, 84))):
+        data, inside = image.data.clone(), torch.ones_like(image.data)
+        data[:, :, rows], inside[:, :, rows] = 400.0, 0.0
+        pair.append(replace(image, data=data))
+        masks.append(replace(image, data=inside))
+    settings = AlignmentSettings(similarity="ncc")
+    plain = align(*pair, "rigid", settings=settings)
+    masked = align(*pair, "rigid", fixed_mask=masks[0], moving_mask=masks[1], settings=settings)
+    assert distance(masked.affine, true, fixed) < 0.2
+    assert distance(plain.affine, true, fixed) > 1.0
+
+
+def test_a_mask_on_another_grid_is_taken_in_its_place():
+    true = make_true(turn(2, 15))
+    fixed, moving = make_pair(true)
+    mask = empty((30, 30), (3.0, 3.0))
+    mask = replace(mask, data=torch.ones_like(mask.data))
+    assert distance(align(fixed, moving, fixed_mask=mask).affine, true, fixed) < 0.2
+
+
+def test_a_wrong_spacing_is_told():
+    fixed, moving = make_pair(make_true(2.6 * torch.eye(2, dtype=torch.float64)))
+    moving = picture(empty((84, 68), (3.0, 3.0)), make_true(2.6 * torch.eye(2, dtype=torch.float64)).inverse())
+    found = align(fixed, moving, "similarity")
+    assert any("check the spacing" in sentence for sentence in found.warnings)
+
+
+def test_colour_is_aligned_on_its_luminance():
+    true = make_true(turn(2, 15))
+    fixed, moving = make_pair(true)
+    colour = replace(moving, data=moving.data.expand(-1, 3, -1, -1))
+    torch.testing.assert_close(
+        align(fixed, colour, "rigid").affine.matrix, align(fixed, moving, "rigid").affine.matrix, atol=1e-3, rtol=0
+    )
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_affine_warp_differentiates_in_the_map_and_the_image(dim):
+    shape = (5, 6, 7)[:dim]
+    random = torch.Generator().manual_seed(0)
+    pixels = torch.rand(1, 1, *shape, generator=random, dtype=torch.float64, requires_grad=True)
+    place = empty(shape, (1.1, 0.9, 1.0)[:dim], tilted=True)
+    matrix = (turn(dim, 7) * 0.8).requires_grad_(True)
+    offset = torch.full((dim,), 0.123, dtype=torch.float64, requires_grad=True)
+
+    def warped(m: Tensor, t: Tensor, values: Tensor) -> Tensor:
+        return affine_warp(replace(place, data=values), place, Affine(m, t), outside=None)
+
+    assert torch.autograd.gradcheck(warped, (matrix, offset, pixels))
+
+
+def test_affine_warp_gives_the_scene_back():
+    true = make_true(turn(2, 15))
+    fixed, moving = make_pair(true)
+    difference = (affine_warp(moving, fixed, true) - fixed.data)[:, :, 15:-15, 15:-15]
+    assert difference.abs().max() < 3.0
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_settings_left_open_go_by_the_number_of_axes(dim):
+    window, nodes = {2: (7, 20_000), 3: (5, 150_000)}[dim]
+    open_, said = AlignmentSettings(), AlignmentSettings(window=9, nodes=5000)
+    assert (open_.window_in(dim), open_.nodes_in(dim)) == (window, nodes)
+    assert (said.window_in(dim), said.nodes_in(dim)) == (9, 5000)
+    fixed, moving = make_pair(make_true(turn(dim, 10)))
+    first, second = (align(fixed, moving, settings=s) for s in (open_, AlignmentSettings(window=window, nodes=nodes)))
+    assert torch.equal(first.affine.matrix, second.affine.matrix)
+
+
+FIXED, MOVING = make_pair(make_true(turn(2, 5)))
+
+
+SOLID = picture(empty((16, 16, 16), (4.0, 4.0, 4.0)))
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: align(FIXED, MOVING, "rigit"), "did you mean 'rigid'"),
+        (lambda: align(FIXED, SOLID), "is 2D but .* is 3D"),
+        (lambda: align(FIXED, replace(MOVING, data=0 * MOVING.data)), "constant"),
+        (lambda: align(FIXED, replace(MOVING, data=MOVING.data / 0)), "NaN"),
+        (lambda: align(FIXED, replace(MOVING, data=MOVING.data.expand(-1, 2, -1, -1))), "channels"),
+        (lambda: align(FIXED, MOVING, fixed_mask=replace(FIXED, data=0 * FIXED.data)), "marks no voxel"),
+        (lambda: align(FIXED, MOVING, moving_mask=SOLID), "is 3D but"),
+        (lambda: AlignmentSettings(similarity="nncc"), "did you mean 'ncc'"),
+        (lambda: AlignmentSettings(window=4), "window must be"),
+        (lambda: AlignmentSettings(min_overlap=0.0), "min_overlap must"),
+        (lambda: AlignmentSettings(nodes=10), "nodes must"),
+        (lambda: AlignmentSettings(steps=0), "steps must"),
+    ],
+)
+def test_bad_input_is_one_sentence(call, sentence):
+    with pytest.raises(InputError, match=sentence):
+        call()

@@ -1,0 +1,253 @@
+"""Guidance: masks hide, landmarks pull, channels add up, a start is gone on from; what does not fit is named."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from pictures import bend, blobs, disc
+from torch import Tensor
+
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image, resample
+from torchdeform.core.transform import Affine
+from torchdeform.core.warp import sample, warp
+from torchdeform.errors import InputError
+from torchdeform.registration.deformable import register
+from torchdeform.registration.problem import Guidance, moved
+from torchdeform.registration.settings import RegistrationSettings
+
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+QUICK = RegistrationSettings(steps=(30, 20, 10), weight_div=1.0, length=6.0, window=7, align="none")
+
+
+@pytest.mark.parametrize("similarity", ["lncc", "ssd", {"lncc": 1.0, "ncc": 1.0}])
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_garbage_outside_the_masks_does_not_change_anything(similarity, symmetric):
+    shape = (48, 40)
+    settings = replace(QUICK, similarity=similarity, symmetric=symmetric)
+    masks = disc(shape, (24, 18), 15), disc(shape, (22, 20), 16)
+    guidance = Guidance(fixed_mask=masks[0], moving_mask=masks[1])
+    images = blobs(shape, 1), blobs(shape, 2)
+    garbage = torch.full(shape, torch.nan), torch.randn(shape) * 1e4
+    spoilt = [torch.where(m > 0, i, g) for m, i, g in zip(masks, images, garbage, strict=True)]
+    clean, dirty = register(*images, settings, guidance=guidance), register(*spoilt, settings, guidance=guidance)
+    assert torch.equal(clean.displacement, dirty.displacement)
+    assert torch.equal(clean.similarity_after, dirty.similarity_after)
+
+
+@pytest.mark.parametrize("side", ["fixed_mask", "moving_mask"])
+def test_a_lesion_that_is_masked_out_is_ignored(side):
+    shape, centre = (64, 64), (30, 34)
+    grid, moving = Grid(shape), blobs(shape, 1)
+    truth = bend(grid, 2.0)
+    fixed, lesion = warp(moving, truth, grid), disc(shape, centre, 9)
+    texture = blobs(shape, 7) * 4
+    if side == "fixed_mask":
+        fixed = torch.where(lesion > 0, texture, fixed)
+    else:
+        moving = torch.where(lesion > 0, texture, moving)
+    errors = []
+    for guidance in (Guidance(), Guidance(**{side: 1 - lesion})):
+        u = register(fixed, moving, QUICK, guidance=guidance).displacement
+        errors.append((u - truth).square().sum(1).sqrt()[:, 3:-3, 3:-3].mean().item())
+    assert errors[1] < 0.4 * errors[0]
+    assert errors[1] < 0.4
+
+
+def test_boolean_masks_and_masks_of_ones_mean_what_they_say():
+    shape = (40, 40)
+    images, mask = (blobs(shape, 1), blobs(shape, 2)), disc(shape, (20, 20), 14)
+    as_float, as_bool = (register(*images, QUICK, guidance=Guidance(fixed_mask=m)) for m in (mask, mask > 0))
+    assert torch.equal(as_float.displacement, as_bool.displacement)
+    plain = register(*images, replace(QUICK, steps=(5,)))
+    ones = register(*images, replace(QUICK, steps=(5,)), guidance=Guidance(fixed_mask=torch.ones(1, 1, *shape)))
+    torch.testing.assert_close(plain.displacement, ones.displacement, rtol=0, atol=1e-3)
+
+
+def test_every_channel_counts():
+    """The halves of the truth that one channel cannot see, the other does."""
+    shape = (64, 64)
+    grid, truth = Grid(shape), bend(Grid(shape), 2.5)
+    half = (grid.points()[:, :1] < 32).float()
+    both = torch.cat([blobs(shape, 1) * half, 1000 * blobs(shape, 2) * (1 - half)], dim=1)
+    fixed = warp(both, truth, grid)
+    inside = (..., slice(4, -4), slice(4, -4))
+    errors = []
+    for channels in (slice(0, 1), slice(1, 2), slice(0, 2)):
+        u = register(fixed[:, channels], both[:, channels], QUICK).displacement
+        errors.append((u - truth).square().sum(1).sqrt()[inside].mean().item())
+    assert errors[2] < 0.6 * min(errors[:2])
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_a_start_is_gone_on_from(symmetric):
+    shape = (64, 64)
+    grid = Grid(shape)
+    truth = bend(grid, 4.0)
+    waves = torch.sin(grid.points().sum(1, keepdim=True)) + blobs(shape, 1)  # period 4.4: local optima everywhere
+    settings = replace(QUICK, steps=(0, 0, 10), symmetric=symmetric)
+    given = register(warp(waves, truth, grid), waves, settings, start=truth)
+    without = register(warp(waves, truth, grid), waves, settings)
+    assert given.similarity_after > without.similarity_after + 0.1
+    assert (given.displacement - truth).abs().max() < 1.0
+    still = register(waves, waves, replace(settings, steps=(0,)), start=truth)
+    torch.testing.assert_close(still.displacement, truth, rtol=0, atol=0.05 if symmetric else 1e-6)
+
+
+def test_a_batch_with_guidance_equals_its_items():
+    shape = (40, 48)
+    grid = Grid(shape)
+    moving = blobs(shape, 3, items=2).double()
+    fixed = warp(moving, bend(grid, 2.0).double(), grid)
+    fixed[1] = blobs(shape, 9)[0]
+    masks = torch.cat([disc(shape, (20, 20), 15), disc(shape, (24, 30), 12)]).double()
+    points = torch.tensor([[[12.0, 25.0], [15.0, 30.0]], [[20.0, 30.0], [22.0, 36.0]]]).double()
+    settings = replace(QUICK, points_weight=0.1)
+    whole = Guidance(fixed_mask=masks, fixed_points=points, moving_points=points + 1)
+    for symmetric in (False, True):
+        settings = replace(settings, symmetric=symmetric)
+        together = register(fixed, moving, settings, guidance=whole)
+        for item in range(2):
+            part = slice(item, item + 1)
+            own = Guidance(fixed_mask=masks[part], fixed_points=points[part], moving_points=points[part] + 1)
+            alone = register(fixed[part], moving[part], settings, guidance=own)
+            torch.testing.assert_close(together.displacement[part], alone.displacement, rtol=0, atol=2e-3)
+            torch.testing.assert_close(
+                together.evaluation.after.distances[part], alone.evaluation.after.distances, rtol=0, atol=2e-3
+            )
+
+
+def oblique_pair(truth_size: float = 3.0) -> tuple[Image, Image, Affine, Image, Tensor]:
+    """Fixed and moving cut from one wide image on tilted grids; the affine map, the wide image, its displacement."""
+    wide = Image(blobs((130, 140), 1), Grid((130, 140), (0.8, 0.8)), (-10.0, -5.0))
+    truth = bend(wide.grid, truth_size / 0.8)
+    affine = Affine(torch.tensor([[1.05, 0.15], [-0.12, 0.97]]).double(), torch.tensor([7.0, -4.0]).double())
+    tilts = [((math.cos(a), -math.sin(a)), (math.sin(a), math.cos(a))) for a in (-0.1, 0.08)]
+    frames = (
+        Image(torch.zeros(1, 1, 64, 72), Grid((64, 72)), (4.0, 14.0), tilts[0], "fixed"),
+        Image(torch.zeros(1, 1, 66, 78), Grid((66, 78), (1.05, 0.9)), (16.0, 10.0), tilts[1], "moving"),
+    )
+    bent = replace(wide, data=warp(wide.data, truth, wide.grid))
+    fixed = replace(frames[0], data=resample(bent, frames[0], outside=None).float())
+    moving = replace(frames[1], data=resample(moved(wide, affine), frames[1], outside=None).float())
+    return fixed, moving, affine, wide, truth
+
+
+def world_landmarks(wide: Image, truth: Tensor, affine: Affine) -> tuple[Tensor, Tensor]:
+    x, y = torch.meshgrid(torch.linspace(25, 62, 5), torch.linspace(28, 60, 5), indexing="ij")
+    points = torch.stack([x.flatten(), y.flatten()]).unsqueeze(0).double()
+    place = wide.to_grid(points)
+    return points, affine(wide.to_world(place + sample(truth.double(), place, wide.grid)))
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_an_affine_map_comes_after_the_displacement(symmetric):
+    fixed, moving, affine, wide, truth = oblique_pair()
+    points, ends = world_landmarks(wide, truth, affine)
+    guidance = Guidance(fixed_points=points, moving_points=ends)
+    result = register(fixed, moving, replace(QUICK, symmetric=symmetric), guidance=guidance, affine=affine)
+    found = result.evaluation
+    assert found.before.distances.mean() > found.aligned.distances.mean() > 1
+    assert found.after.distances.mean() < 0.3
+    assert result.diagnosis.folds.item() == 0
+    nodes = fixed.grid.points(dtype=torch.float64) + result.displacement
+    seen = sample(moving.data, moving.to_grid(affine(fixed.to_world(nodes))), moving.grid, outside=0.0)
+    torch.testing.assert_close(result.warped, seen.float(), rtol=0, atol=1e-4)
+
+
+def test_masks_of_images_may_lie_on_grids_of_their_own():
+    fixed, moving, affine, wide, truth = oblique_pair()
+    points, ends = world_landmarks(wide, truth, affine)
+    coarse = Image(torch.zeros(1, 1, 50, 50), Grid((50, 50), (2.5, 2.5)), (-20.0, -20.0), name="mask")
+    near = [
+        ((coarse.to_world(coarse.grid.points()) - p.mean(2).view(1, 2, 1, 1)).square().sum(1, keepdim=True) < 27**2)
+        for p in (points, ends)
+    ]
+    masks = [replace(coarse, data=255 * region.float()) for region in near]
+    garbage = Image(1e4 * torch.randn(fixed.data.shape), fixed.grid, fixed.origin, fixed.direction)
+    inside = resample(masks[0], fixed, mode="nearest") > 0
+    spoilt = replace(fixed, data=torch.where(inside, fixed.data, garbage.data))
+    guidance = Guidance(fixed_mask=masks[0], moving_mask=masks[1], fixed_points=points, moving_points=ends)
+    result = register(spoilt, moving, QUICK, guidance=guidance, affine=affine)
+    assert result.evaluation.after.distances.mean() < 0.5 * result.evaluation.aligned.distances.mean()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_everything_together_on_every_device(symmetric, device):
+    fixed, moving, affine, wide, truth = oblique_pair()
+    points, ends = world_landmarks(wide, truth, affine)
+    ones = [replace(i, data=torch.ones_like(i.data)) for i in (fixed, moving)]
+    guidance = Guidance(fixed_points=points, moving_points=ends, fixed_mask=ones[0], moving_mask=ones[1])
+    settings = replace(QUICK, symmetric=symmetric, points_weight=0.1)
+    start = torch.zeros(1, 2, *fixed.grid.shape).to(device)
+    pair = fixed.to(device), moving.to(device)
+    result = register(*pair, settings, guidance=guidance.to(device), affine=affine, start=start)
+    assert result.warped.device.type == device
+    assert result.evaluation.after.distances.mean() < 0.2
+    assert result.diagnosis.folds.item() == 0
+
+
+def image(data: Tensor, name: str = "image") -> Image:
+    return Image(data, Grid(tuple(data.shape[2:])), name=name)
+
+
+PAIR = torch.rand(1, 1, 16, 16), torch.rand(1, 1, 16, 16)
+
+
+POINTS = torch.rand(1, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("guidance", "message"),
+    [
+        ({"fixed_mask": torch.zeros(1, 1, 16, 16)}, "fixed_mask is 0 everywhere"),
+        ({"moving_mask": torch.full((1, 1, 16, 16), 255.0)}, "moving_mask must hold weights from 0 to 1"),
+        ({"moving_mask": torch.full((1, 1, 16, 16), torch.nan)}, "moving_mask must hold weights"),
+        ({"moving_mask": torch.ones(1, 1, 16, 15)}, "moving_mask must have shape"),
+        ({"moving_mask": image(torch.ones(1, 1, 16, 16))}, "moving_mask must be a tensor"),
+        ({"fixed_points": POINTS}, "moving_points are missing"),
+        ({"moving_labels": PAIR[0]}, "fixed_labels are missing"),
+        ({"fixed_points": POINTS, "moving_points": POINTS[..., :2]}, "both have shape"),
+        ({"fixed_points": POINTS, "moving_points": POINTS / 0}, "must be finite"),
+        ({"fixed_points": POINTS[:, :1], "moving_points": POINTS[:, :1]}, r"must have shape \(1, 2, n\)"),
+        ({"fixed_labels": PAIR[0], "moving_labels": PAIR[1]}, "whole numbers"),
+        ({"fixed_labels": torch.ones(1, 1, 16, 16), "moving_labels": torch.zeros(1, 1, 16, 16)}, "no label in common"),
+    ],
+)
+def test_guidance_that_does_not_fit_is_named(guidance, message):
+    with pytest.raises(InputError, match=message):
+        register(*PAIR, replace(QUICK, steps=(1,)), guidance=Guidance(**guidance))
+
+
+@pytest.mark.parametrize(
+    ("guidance", "message"),
+    [
+        ({"fixed_mask": torch.ones(1, 1, 16, 16)}, "fixed_mask must be an Image"),
+        ({"fixed_mask": image(torch.ones(1, 1, 8, 8, 8), "volume")}, "volume must be 2D"),
+        ({"fixed_mask": image(torch.ones(1, 3, 16, 16), "rgb")}, "rgb must be 2D with one channel"),
+        ({"moving_mask": image(torch.zeros(1, 1, 16, 16), "empty.png")}, "empty.png is 0 everywhere"),
+        ({"fixed_points": POINTS.repeat(2, 1, 1), "moving_points": POINTS.repeat(2, 1, 1)}, "must have shape"),
+    ],
+)
+def test_guidance_that_does_not_fit_images_is_named(guidance, message):
+    with pytest.raises(InputError, match=message):
+        register(*map(image, PAIR), replace(QUICK, steps=(1,), align="none"), guidance=Guidance(**guidance))
+
+
+def test_starts_and_affine_maps_that_do_not_fit_are_named():
+    fold = torch.zeros(1, 2, 16, 16)
+    fold[:, 0, 8] = 3.0
+    for start, message in (
+        (fold, "start folds"),
+        (torch.zeros(2, 2, 16, 16), "batch items"),
+        (torch.zeros(1, 3, 16, 16), "start must have shape"),
+        (torch.full((1, 2, 16, 16), torch.nan), "start folds or is not finite"),
+    ):
+        with pytest.raises(InputError, match=message):
+            register(*PAIR, QUICK, start=start)
+    with pytest.raises(InputError, match="must be Images"):
+        register(*PAIR, QUICK, affine=Affine.identity(2))
