@@ -13,8 +13,8 @@ from torchdeform.core.image import Image, overlap, resample
 from torchdeform.core.resampling import MIN_NODES
 from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
-from torchdeform.metrics.similarity import similarity_weights
-from torchdeform.pipeline.memory import available, estimate, readable
+from torchdeform.metrics.similarity import needs_common_scale
+from torchdeform.pipeline.memory import available, footprint, readable
 from torchdeform.registration.settings import RegistrationSettings
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
@@ -68,6 +68,7 @@ class _Pair:
     moving: Image
     aligned: bool
     settings: RegistrationSettings
+    memory: int | None
 
     @property
     def both(self) -> tuple[tuple[Image, Image], tuple[Image, Image]]:
@@ -83,6 +84,7 @@ def preflight(
     moving_mask: Image | None = None,
     aligned: bool = False,
     settings: RegistrationSettings | None = None,
+    memory: int | None = None,
 ) -> Report:
     """Return what looks wrong with a pair of images before it is registered.
 
@@ -93,6 +95,7 @@ def preflight(
         moving_mask: the same for the moving image.
         aligned: whether an alignment comes before the deformation: images that lie apart are then no error.
         settings: how they will be registered; the defaults when None.
+        memory: bytes that the registration is kept to by a coarser grid; None where it has what is free.
 
     Returns:
         `Report`. Nothing is raised: `Report.require_ok` does that.
@@ -100,7 +103,7 @@ def preflight(
     Notes:
         Images are compared on coarse grids, each voxel is looked at only for its value: less than a second at 128³.
     """
-    pair = _Pair(fixed, moving, aligned, settings or RegistrationSettings())
+    pair = _Pair(fixed, moving, aligned, settings or RegistrationSettings(), memory)
     found = [finding for look in _ALWAYS for finding in look(pair)]
     if fixed.grid.dim != moving.grid.dim:
         found.append(
@@ -226,7 +229,7 @@ def _about_scale(pair: _Pair) -> Iterator[Finding]:
     ratio = max(ranges) / max(min(ranges), 1e-30)
     if ratio > _SCALE_RATIO:
         text = f"{pair.fixed.name} spans {ranges[0]:.4g} grey values and {pair.moving.name} {ranges[1]:.4g}"
-        if "ssd" in similarity_weights(pair.settings.similarity):
+        if needs_common_scale(pair.settings.similarity):
             yield _warning(f"{text}; scale them alike, or use another similarity than ssd")
         else:
             yield _note(f"{text}; scale them alike if they are of one kind and you compare them by ssd")
@@ -267,9 +270,8 @@ def _about_orientation(pair: _Pair) -> Iterator[Finding]:
 def _about_memory(pair: _Pair) -> Iterator[Finding]:
     room = available(pair.fixed.data.device)
     grid = pair.fixed.grid
-    how = {"channels": pair.fixed.data.shape[1], "similarity": pair.settings.similarity, "start": pair.settings.start}
-    need = estimate(grid, **how)
-    if room is None or need < 0.8 * room:
+    need = footprint(grid, pair.fixed.data.shape[1], pair.settings)
+    if pair.memory is not None or room is None or need < 0.8 * room:
         return
     size = "×".join(map(str, grid.shape[::-1]))
     text = (
