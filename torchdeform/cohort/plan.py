@@ -14,7 +14,7 @@ from torchdeform.cohort.pairs import entries
 from torchdeform.cohort.schema import Cohort
 from torchdeform.errors import InputError, nearest_name
 from torchdeform.io import read_displacement, read_image
-from torchdeform.io.files import staged
+from torchdeform.io.files import atomic_folder
 from torchdeform.io.learn2reg import write_voxel_displacement
 from torchdeform.pipeline.register import Outcome, PairFiles, register_files
 from torchdeform.registration.result import Callback
@@ -225,7 +225,7 @@ def register_job(job: Job, *, callback: Callback | None = None) -> Outcome:
 def _with_titles(files: PairFiles) -> PairFiles:
     """Return the files with landmarks written anew into the pair's folder, titled i, j, k as `read_points` wants it."""
     given = {key: path for key in _POINTS if (path := getattr(files, key)) is not None}
-    with staged(files.out) as folder:
+    with atomic_folder(files.out) as folder:
         for key, path in given.items():
             rows = path.read_text(encoding="utf-8-sig")
             (folder / f"{key}.csv").write_text(f"i,j,k\n{rows}", encoding="utf-8")

@@ -23,7 +23,7 @@ from torchdeform.errors import ComputationError, InputError, explain
 EVENTS = "events.jsonl"
 BEGIN, SKIPPED, END = "begin", "skipped", "end"
 
-_STAGED = ".torchdeform-*"  # folders that `io.files.staged` would have removed
+_TEMPORARY_FOLDERS = ".torchdeform-*"  # folders that `io.files.atomic_folder` would have removed
 
 
 @dataclass(frozen=True)
@@ -262,5 +262,5 @@ def _clean(jobs: Iterable[Job], out: Path) -> None:
     own = {job.files.out for job in jobs}
     above = {folder for place in own for folder in place.parents if folder.is_relative_to(out)}
     for folder in own | above:
-        for rest in folder.glob(_STAGED):
+        for rest in folder.glob(_TEMPORARY_FOLDERS):
             shutil.rmtree(rest, ignore_errors=True)

@@ -31,7 +31,7 @@ def beginning(path: Path, count: int) -> bytes:
 
 
 @contextmanager
-def staged(folder: Path) -> Iterator[Path]:
+def atomic_folder(folder: Path) -> Iterator[Path]:
     """Yield an empty folder whose files move into ``folder`` at the end, or vanish if anything went wrong.
 
     Args:

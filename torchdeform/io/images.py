@@ -16,7 +16,7 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import dicom, itk
-from torchdeform.io.files import staged, suffix
+from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.io.tiff import read_tiff, write_tiff
 from torchdeform.io.validation import BROKEN_OFF, NOT_SQUARE, other_kind, require_sound
 
@@ -164,7 +164,7 @@ def write_image(image: Image, path: str | os.PathLike[str]) -> None:
     """
     file = Path(path)
     pixels, paged = _stored(image, file), suffix(file) in (".tif", ".tiff") and image.grid.dim == 3
-    with staged(file.parent) as folder:
+    with atomic_folder(file.parent) as folder:
         if paged and pixels.dtype.name in _PAGED:
             write_tiff(pixels, image.grid.spacing, folder / file.name)
         else:

@@ -10,7 +10,7 @@ import torch
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import itk
-from torchdeform.io.files import staged, suffix
+from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.io.images import FORMATS, read_image, write_image
 
 # Types with values that float32, in which images are read, does not tell apart.
@@ -58,7 +58,7 @@ def write_labels(image: Image, path: str | os.PathLike[str]) -> None:
             raise InputError(f"{path}: {ending} files cannot hold labels of type {image.pixel_type}; use .nii.gz")
         return write_image(image, file)
     values = image.data[0].detach().cpu().numpy().astype(image.pixel_type)
-    with staged(file.parent) as folder:
+    with atomic_folder(file.parent) as folder:
         itk.save(itk.from_values(values, image), folder / file.name)
     return None
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchdeform.core.image import Image
 from torchdeform.io import itk
-from torchdeform.io.files import staged
+from torchdeform.io.files import atomic_folder
 
 
 def voxel_displacement(u: Tensor, fixed: Image, moving: Image) -> Tensor:
@@ -54,5 +54,5 @@ def write_voxel_displacement(u: Tensor, fixed: Image, moving: Image, path: Path)
     image.SetSpacing((*fixed.grid.spacing[::-1], 1.0))
     image.SetOrigin((*fixed.origin, 0.0))
     image.SetDirection(direction.flatten().tolist())
-    with staged(path.parent) as folder:
+    with atomic_folder(path.parent) as folder:
         itk.save(image, folder / path.name)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.io.files import staged, suffix
+from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.io.validation import require_sound
 
 _WORLD, _VOXEL = ("x", "y", "z"), ("i", "j", "k")
@@ -119,7 +119,7 @@ def write_points(points: Points, path: _Path) -> None:
     file = Path(path)
     require_points_file(file)
     text = _WRITERS[suffix(file)](points)
-    with staged(file.parent) as folder:
+    with atomic_folder(file.parent) as folder:
         (folder / file.name).write_text(text, encoding="utf-8")
 
 

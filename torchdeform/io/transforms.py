@@ -15,7 +15,7 @@ from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Stage, Transform
 from torchdeform.errors import InputError
 from torchdeform.io import itk
-from torchdeform.io.files import native_stderr, staged, suffix
+from torchdeform.io.files import atomic_folder, native_stderr, suffix
 from torchdeform.io.validation import require_sound
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def write_displacement(u: Tensor, fixed: Image, path: _Path) -> None:
     file = Path(path)
     _check_field(u, fixed, "write_displacement: u")
     field = itk.to_world_vectors(u, fixed, np.float32)
-    with staged(file.parent) as folder:
+    with atomic_folder(file.parent) as folder:
         itk.save(itk.from_values(field, fixed), folder / file.name)
 
 
@@ -235,7 +235,7 @@ _TO_ITK: dict[type, Callable[[Any], "sitk.Transform"]] = {Affine: _affine, Displ
 def _save(transform: "sitk.Transform", path: Path) -> None:
     import SimpleITK as sitk
 
-    with staged(path.parent) as folder:
+    with atomic_folder(path.parent) as folder:
         try:
             with native_stderr():
                 sitk.WriteTransform(transform, str(folder / path.name))

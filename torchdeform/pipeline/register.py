@@ -13,7 +13,7 @@ from torchdeform.core.resampling import restrict
 from torchdeform.core.transform import Transform
 from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.io import read_image, write_displacement, write_image, write_transform
-from torchdeform.io.files import require_writable, staged
+from torchdeform.io.files import atomic_folder, require_writable
 from torchdeform.io.images import ending_like
 from torchdeform.io.labels import read_labels, write_labels
 from torchdeform.io.points import matched, read_points
@@ -246,7 +246,7 @@ def _publish(files: PairFiles, inputs: Inputs, result: RegistrationResult, run: 
     """Write every file of a result into the folder, all of them or none."""
     out, start = files.out, perf_counter()
     former = _former_files(out)
-    with staged(out) as folder:
+    with atomic_folder(out) as folder:
         _write_images(folder, files, inputs, result)
         written = perf_counter()
         scene = make_scene(inputs.fixed, inputs.moving, result)
