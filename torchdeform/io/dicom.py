@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import itk
-from torchdeform.io.files import beginning
-from torchdeform.io.validation import BROKEN_OFF
+from torchdeform.io.files import read_head
+from torchdeform.io.validation import DAMAGED
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
@@ -70,7 +70,7 @@ class Slice:
 def is_dicom(path: Path) -> bool:
     """Return whether a file begins like DICOM, whatever its name."""
     start, magic = _MAGIC
-    return beginning(path, start + len(magic))[start:] == magic
+    return read_head(path, start + len(magic))[start:] == magic
 
 
 def read_file(path: Path) -> Image:
@@ -144,14 +144,14 @@ def _header(path: Path) -> Slice | None:
     """Return what the header says, or None for DICOM files that hold no image."""
     import SimpleITK as sitk
 
-    if _NO_IMAGE.search(beginning(path, 2048)):
+    if _NO_IMAGE.search(read_head(path, 2048)):
         return None
     reader = sitk.ImageFileReader()
     reader.SetImageIO("GDCMImageIO")
     reader.SetFileName(str(path))
     error = itk.quietly(reader.ReadImageInformation)
     if isinstance(error, RuntimeError):
-        raise InputError(f"{path} {BROKEN_OFF}") from error
+        raise InputError(f"{path} {DAMAGED}") from error
     return _slice(path, reader)
 
 
@@ -216,7 +216,7 @@ def _load(path: Path) -> "sitk.Image":
     try:
         return itk.load(path)
     except RuntimeError as error:
-        raise InputError(f"{path} {BROKEN_OFF}") from error
+        raise InputError(f"{path} {DAMAGED}") from error
 
 
 def _require_regular(slices: Sequence[Slice], name: str) -> float:

@@ -24,7 +24,7 @@ def stem(path: Path) -> str:
     return path.name[: len(path.name) - len(suffix(path))] or path.name
 
 
-def beginning(path: Path, count: int) -> bytes:
+def read_head(path: Path, count: int) -> bytes:
     """Return the first bytes of a file."""
     with path.open("rb") as file:
         return file.read(count)

@@ -18,7 +18,7 @@ from torchdeform.errors import InputError
 from torchdeform.io import dicom, itk
 from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.io.tiff import read_tiff, write_tiff
-from torchdeform.io.validation import BROKEN_OFF, NOT_SQUARE, other_kind, require_sound
+from torchdeform.io.validation import DAMAGED, NOT_SQUARE, other_kind, require_sound
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ _PLAIN_PICTURES = (".png", ".gif", ".webp")
 
 
 # What ITK's readers say, each in its own words, of a file that breaks off.
-_SHORT = ("fread got only", "inflate", "Cannot read requested file", "unexpected end")
+_DAMAGE_SIGNS = ("fread got only", "inflate", "Cannot read requested file", "unexpected end")
 
 # Types of volumes that TIFF holds with the distance of its pages.
 _PAGED = ("uint8", "uint16", "float32")
@@ -100,7 +100,7 @@ def _read_packed(path: Path) -> Image:
             with gzip.open(path) as source, unpacked.open("wb") as target:
                 shutil.copyfileobj(source, target)
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-            raise InputError(f"{path} {BROKEN_OFF}") from error
+            raise InputError(f"{path} {DAMAGED}") from error
         try:
             return replace(read_image(unpacked), name=str(path))
         except InputError as error:
@@ -128,8 +128,8 @@ def _read_otherwise(path: Path, reason: str) -> Image:
         return _picture(pixels[0] if len(pixels) == 1 else pixels, str(path))
     if "orthonormal" in reason:
         raise InputError(f"{path} {NOT_SQUARE}")
-    if any(sign in reason for sign in _SHORT):
-        raise InputError(f"{path} {BROKEN_OFF}")
+    if any(sign in reason for sign in _DAMAGE_SIGNS):
+        raise InputError(f"{path} {DAMAGED}")
     if "allocate memory" in reason:
         raise InputError(f"{path} says that it is larger than the memory here; if it is not, its header is damaged")
     if "determine ImageIO" in reason:

@@ -14,13 +14,13 @@ from torchdeform.core.grid import Grid, slabs
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io.files import native_stderr
-from torchdeform.io.validation import BROKEN_OFF, NOT_SQUARE
+from torchdeform.io.validation import DAMAGED, NOT_SQUARE
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
 
 # What the libraries below ITK print, rather than raise, when a file breaks off.
-_BROKEN_OFF = ("TIFFReadDirectory", "TIFFFetchDirectory", "TIFFFillStrip", "not read completely")
+_DAMAGE_SIGNS = ("TIFFReadDirectory", "TIFFFetchDirectory", "TIFFFillStrip", "not read completely")
 
 # The columns of a direction matrix may deviate from unit length and right angles by this much.
 _SQUARE = 1e-3
@@ -41,8 +41,8 @@ def load(path: Path) -> "sitk.Image":
     reader.SetFileName(str(path))
     with native_stderr() as printed, _no_warnings():
         image = _execute(reader)
-    if any(sign in line for line in printed for sign in _BROKEN_OFF):
-        raise InputError(f"{path} {BROKEN_OFF}")
+    if any(sign in line for line in printed for sign in _DAMAGE_SIGNS):
+        raise InputError(f"{path} {DAMAGED}")
     if isinstance(image, RuntimeError):
         raise image
     return image

@@ -17,7 +17,7 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import itk
-from torchdeform.io.validation import BROKEN_OFF
+from torchdeform.io.validation import DAMAGED
 
 if TYPE_CHECKING:
     from tifffile import TiffFile
@@ -30,7 +30,7 @@ _MILLIMETRES = {
 }  # fmt: skip
 _RESOLUTION_UNITS = {2: 25.4, 3: 10.0}  # of the resolution tag: inch, centimetre
 _DEPTH, _CHANNELS = "ZQI", "CS"  # tifffile's letters for axes: depth or unnamed pages; channels or samples
-_BROKEN = ("invalid offset", "invalid value offset", "invalid page offset", "corrupted")
+_DAMAGE_SIGNS = ("invalid offset", "invalid value offset", "invalid page offset", "corrupted")
 _ERRORS = (OSError, ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError, struct.error)
 
 
@@ -49,16 +49,16 @@ def read_tiff(path: Path) -> Image:
     import tifffile
 
     try:
-        with _complaints() as complaints, tifffile.TiffFile(path) as file:
+        with _log_messages() as messages, tifffile.TiffFile(path) as file:
             axes, shape = _require_one(file, path)
             values, spacing = _values(file, path, shape), _spacing(file)
             table = file.series[0].keyframe.colormap
     except InputError:
         raise
     except _ERRORS as error:
-        raise InputError(f"{path} {BROKEN_OFF}") from error
-    if any(sign in line for line in complaints for sign in _BROKEN):
-        raise InputError(f"{path} {BROKEN_OFF}")
+        raise InputError(f"{path} {DAMAGED}") from error
+    if any(sign in line for line in messages for sign in _DAMAGE_SIGNS):
+        raise InputError(f"{path} {DAMAGED}")
     if table is not None and values.dtype.kind == "u" and values.max() < table.shape[1]:
         colours = np.take(table // 256, values.astype(np.intp), axis=1)  # tables have 16 bits, pictures made of them 8
         axes, values = axes + "S", np.moveaxis(colours, 0, -1).astype(np.uint8)
@@ -68,7 +68,7 @@ def read_tiff(path: Path) -> Image:
 
 
 @contextmanager
-def _complaints() -> Iterator[list[str]]:
+def _log_messages() -> Iterator[list[str]]:
     """Collect what tifffile logs, and keep it off the terminal."""
     lines: list[str] = []
     handler = logging.Handler()

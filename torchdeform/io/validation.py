@@ -12,10 +12,10 @@ from typing import BinaryIO
 import numpy as np
 
 from torchdeform.errors import InputError, nearest_name
-from torchdeform.io.files import beginning, suffix
-from torchdeform.io.headers import about_meta, about_nrrd
+from torchdeform.io.files import read_head, suffix
+from torchdeform.io.headers import check_metaimage, check_nrrd
 
-BROKEN_OFF = "is damaged or incomplete; fetch or export it again"
+DAMAGED = "is damaged or incomplete; fetch or export it again"
 EMPTY = "is empty; fetch or export it again"
 NOT_SQUARE = "has axes that are not at right angles; reslice it onto a rectangular grid first"
 NOT_FINITE = "has pixels that are NaN or infinite; replace them first, for instance by 0"
@@ -71,60 +71,60 @@ def require_sound(path: Path) -> None:
     if not path.is_file():
         raise InputError(f"{path} is no file but a device or a pipe; give an image file")
     try:
-        complaint = _COMPLAINTS.get(suffix(path), _about_nothing)(path) if path.stat().st_size else EMPTY
+        fault = _CHECKS.get(suffix(path), _check_nothing)(path) if path.stat().st_size else EMPTY
         path.open("rb").close()
     except OSError as error:
         raise InputError(f"{path} cannot be opened: {error.strerror}; check its permissions") from error
-    if complaint:
-        raise InputError(f"{path} {complaint}")
+    if fault:
+        raise InputError(f"{path} {fault}")
 
 
 def other_kind(path: Path) -> str:
     """Return the ending that fits what the file holds, or an empty string if that is not known or is what it has."""
-    head = beginning(path, 512)
+    head = read_head(path, 512)
     kind = next((ending for start, magic, ending in _KINDS if head[start:].startswith(magic)), "")
     return "" if suffix(path).endswith(kind) or kind == _ALIKE.get(suffix(path)) else kind
 
 
-def _about_nothing(_: Path) -> None:
+def _check_nothing(_: Path) -> None:
     return None
 
 
-def _about_jpeg(path: Path) -> str | None:
+def _check_jpeg(path: Path) -> str | None:
     """The last scan (FF DA) must be followed by the end of the image (FF D9); neither occurs inside coded pixels."""
     content = path.read_bytes()
-    return None if content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda") else BROKEN_OFF
+    return None if content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda") else DAMAGED
 
 
-def _about_bmp(path: Path) -> str | None:
+def _check_bmp(path: Path) -> str | None:
     """The header tells the size of the file."""
-    return None if int.from_bytes(beginning(path, 6)[2:], "little") <= path.stat().st_size else BROKEN_OFF
+    return None if int.from_bytes(read_head(path, 6)[2:], "little") <= path.stat().st_size else DAMAGED
 
 
-def _about_nifti(path: Path) -> str | None:
+def _check_nifti(path: Path) -> str | None:
     try:
         with path.open("rb") if suffix(path) == ".nii" else gzip.open(path) as file:
-            return _about_voxels(file)
+            return _check_voxels(file)
     except gzip.BadGzipFile:
         known = other_kind(path)
-        return f"is not compressed but a {known} file; rename it" if known else BROKEN_OFF
+        return f"is not compressed but a {known} file; rename it" if known else DAMAGED
     except (EOFError, zlib.error):
-        return BROKEN_OFF
+        return DAMAGED
 
 
-def _about_voxels(file: _Stream) -> str | None:
+def _check_voxels(file: _Stream) -> str | None:
     """Read a NIfTI stream from header to end; what is no NIfTI is left to others to judge."""
     head = file.read(540)
     if len(head) < 348:
-        return BROKEN_OFF
+        return DAMAGED
     for order in "<>":
         layout = _NIFTI.get(struct.unpack_from(order + "i", head)[0])
         if layout is not None and len(head) >= layout.offset[1] + 8:
-            return _about_header(head, order, layout) or _about_body(file, head, order, layout)
+            return _check_header(head, order, layout) or _check_body(file, head, order, layout)
     return None
 
 
-def _about_header(head: bytes, order: str, layout: _Layout) -> str | None:
+def _check_header(head: bytes, order: str, layout: _Layout) -> str | None:
     """Sizes, spacings and the place of the voxels must be numbers that make sense; the library below mends them."""
     rank, *sizes = _field(head, order, layout.dim)
     if not 1 <= rank <= 7 or min(sizes[:rank]) < 1:
@@ -133,10 +133,10 @@ def _about_header(head: bytes, order: str, layout: _Layout) -> str | None:
     if not all(math.isfinite(h) and h != 0 for h in spacing):
         return f"has the spacing {spacing} in its header; mend the header"
     offset = _field(head, order, layout.offset)[0]
-    return None if math.isfinite(offset) and offset >= 0 else BROKEN_OFF
+    return None if math.isfinite(offset) and offset >= 0 else DAMAGED
 
 
-def _about_body(file: _Stream, head: bytes, order: str, layout: _Layout) -> str | None:
+def _check_body(file: _Stream, head: bytes, order: str, layout: _Layout) -> str | None:
     rank, *sizes = _field(head, order, layout.dim)
     missing = math.prod(sizes[:rank]) * _field(head, order, layout.bitpix)[0] // 8
     kind = _FLOATS.get(_field(head, order, layout.datatype)[0])
@@ -148,21 +148,21 @@ def _about_body(file: _Stream, head: bytes, order: str, layout: _Layout) -> str 
             finite = finite and bool(np.isfinite(np.frombuffer(chunk, order + kind)).all())
     while file.read(_CHUNK):  # to the end, where a compressed file has its checksum
         pass
-    return BROKEN_OFF if missing else None if finite else NOT_FINITE
+    return DAMAGED if missing else None if finite else NOT_FINITE
 
 
 def _field(head: bytes, order: str, field: tuple[str, int]) -> tuple[int, ...]:
     return struct.unpack_from(order + field[0], head, field[1])
 
 
-_COMPLAINTS: dict[str, Callable[[Path], str | None]] = {
-    ".jpg": _about_jpeg,
-    ".jpeg": _about_jpeg,
-    ".bmp": _about_bmp,
-    ".mha": about_meta,
-    ".mhd": about_meta,
-    ".nrrd": about_nrrd,
-    ".nhdr": about_nrrd,
-    ".nii": _about_nifti,
-    ".nii.gz": _about_nifti,
+_CHECKS: dict[str, Callable[[Path], str | None]] = {
+    ".jpg": _check_jpeg,
+    ".jpeg": _check_jpeg,
+    ".bmp": _check_bmp,
+    ".mha": check_metaimage,
+    ".mhd": check_metaimage,
+    ".nrrd": check_nrrd,
+    ".nhdr": check_nrrd,
+    ".nii": _check_nifti,
+    ".nii.gz": _check_nifti,
 }
