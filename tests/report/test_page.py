@@ -11,7 +11,7 @@ import torch
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
-from torchdeform.report import make_scene, write_report
+from torchdeform.report import make_report_data, write_report
 from torchdeform.report.pictures import fitting_pictures
 from torchdeform.report.record import describe, write_json
 from torchdeform.report.web_images import frame_of, sprite
@@ -50,8 +50,8 @@ class _Page(HTMLParser):
         return " ".join(" ".join(self.words).split())
 
 
-def _page(tmp_path, scene, record) -> tuple[str, _Page]:
-    write_report(tmp_path / "report.html", scene, record)
+def _page(tmp_path, report_data, record) -> tuple[str, _Page]:
+    write_report(tmp_path / "report.html", report_data, record)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     return text, _Page(text)
 
@@ -111,8 +111,8 @@ def test_names_cannot_do_anything(tmp_path, make_full, dim):
 def test_few_facts_make_a_page(tmp_path, make_image, make_result):
     """A result of two tensors' images, without alignment, levels, labels or commands, in one slice."""
     fixed = make_image((16, 18, 20))
-    scene = make_scene(fixed, fixed, replace(make_result(fixed, fixed), levels=()), slices=1)
-    _, page = _page(tmp_path, scene, None)
+    report_data = make_report_data(fixed, fixed, replace(make_result(fixed, fixed), levels=()), slices=1)
+    _, page = _page(tmp_path, report_data, None)
     assert page.open == []
     assert "Commands" not in page.text
     assert "Landmarks" not in page.text
@@ -120,21 +120,21 @@ def test_few_facts_make_a_page(tmp_path, make_image, make_result):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_record_from_a_file_makes_the_same_page(tmp_path, make_full, dim):
-    scene, record = make_full(dim)
-    first, _ = _page(tmp_path, scene, record)
+    report_data, record = make_full(dim)
+    first, _ = _page(tmp_path, report_data, record)
     write_json(record, tmp_path / "result.json")
-    again, _ = _page(tmp_path, scene, json.loads((tmp_path / "result.json").read_text(encoding="utf-8")))
+    again, _ = _page(tmp_path, report_data, json.loads((tmp_path / "result.json").read_text(encoding="utf-8")))
     assert first == again
 
 
 def test_figures_that_are_missing_are_dashes(tmp_path, make_full):
     """A record from JSON has null where a figure was not finite."""
-    scene, record = make_full(2)
+    report_data, record = make_full(2)
     for key in ("similarity_after", "determinant_max", "inverse_error_mean", "inverse_error_max"):
         record[key] = None
     record["evaluation"]["after"]["dice"]["2"] = math.nan
     record["evaluation"]["after"]["hausdorff_95"]["2"] = None
-    _, page = _page(tmp_path, scene, record)
+    _, page = _page(tmp_path, report_data, record)
     assert "not a number" in page.text
 
 
@@ -152,7 +152,7 @@ def test_a_large_noisy_image_makes_a_small_page(tmp_path, make_image, make_resul
     noise, u = (torch.rand(1, count, *shape, generator=random) for count in (channels, grid.dim))
     fixed = Image(noise, grid, pixel_type="uint8")
     result = replace(make_result(small, small), displacement=u, inverse=-u, warped=noise.flip(2), grid=grid)
-    write_report(tmp_path / "report.html", make_scene(fixed, fixed, result), describe(result, fixed, fixed))
+    write_report(tmp_path / "report.html", make_report_data(fixed, fixed, result), describe(result, fixed, fixed))
     assert (tmp_path / "report.html").stat().st_size < 5e6
 
 
@@ -164,8 +164,10 @@ def test_a_sprite_holds_the_slices_upright(make_image, make_result):
     import numpy as np
     from PIL import Image as Picture
 
-    scene = make_scene(*[make_image((20, 24, 28))] * 2, make_result(*[make_image((20, 24, 28))] * 2), slices=3)
-    cuts = scene.slices[1]
+    report_data = make_report_data(
+        *[make_image((20, 24, 28))] * 2, make_result(*[make_image((20, 24, 28))] * 2), slices=3
+    )
+    cuts = report_data.slices[1]
     assert cuts.plane.turned == (True, False)
     frame = frame_of(cuts.plane, 3, 200)
     pixels = np.zeros((3, *cuts.plane.shape, 1), dtype=np.uint8)
@@ -184,10 +186,10 @@ def test_a_sprite_holds_the_slices_upright(make_image, make_result):
 
 def test_pictures_are_made_smaller_where_they_would_not_fit(make_image, make_result, monkeypatch):
     fixed = make_image((200, 300), channels=3, pixel_type="uint8")
-    scene = make_scene(fixed, fixed, make_result(fixed, fixed))
+    report_data = make_report_data(fixed, fixed, make_result(fixed, fixed))
     sizes = []
     for most in (10**9, 10**5, 0):
         monkeypatch.setattr("torchdeform.report.pictures._MOST", most)
-        found = fitting_pictures(scene)
+        found = fitting_pictures(report_data)
         sizes.append(sum(picture.size for group in found["groups"].values() for picture in group))  # type: ignore
     assert sizes[0] > sizes[1] >= sizes[2] > 0

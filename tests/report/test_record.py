@@ -10,7 +10,7 @@ import torch
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.figures import write_overview
 from torchdeform.report.record import describe, write_json
-from torchdeform.report.report_data import make_scene
+from torchdeform.report.report_data import make_report_data
 
 
 def _pair(make_image, dim, channels=1):
@@ -30,7 +30,7 @@ def _pixels(path) -> torch.Tensor:
 @pytest.mark.parametrize(("dim", "channels"), [(2, 1), (2, 3), (2, 4), (3, 1)])
 def test_overview_is_drawn(tmp_path, make_image, make_result, dim, channels):
     fixed, moving = _pair(make_image, dim, channels)
-    write_overview(tmp_path / "overview.png", make_scene(fixed, moving, make_result(fixed, moving)))
+    write_overview(tmp_path / "overview.png", make_report_data(fixed, moving, make_result(fixed, moving)))
     pixels = _pixels(tmp_path / "overview.png")
     assert min(pixels.shape[1:]) > 400
     assert pixels.std() > 20
@@ -42,14 +42,14 @@ def test_overview_survives_odd_results(tmp_path, make_image, make_result, dim):
     fixed = make_image((64, 9, 8)[-dim:] if dim == 3 else (9, 200))
     result = make_result(fixed, fixed)
     folded = replace(result, displacement=result.displacement * 40, levels=())
-    write_overview(tmp_path / "overview.png", make_scene(fixed, fixed, folded, slices=1))
+    write_overview(tmp_path / "overview.png", make_report_data(fixed, fixed, folded, slices=1))
     assert _pixels(tmp_path / "overview.png").std() > 5
 
 
 def test_overview_is_the_same_every_time(tmp_path, make_image, make_result):
     fixed, moving = _pair(make_image, 2)
     for name in ("a.png", "b.png"):
-        write_overview(tmp_path / name, make_scene(fixed, moving, make_result(fixed, moving)))
+        write_overview(tmp_path / name, make_report_data(fixed, moving, make_result(fixed, moving)))
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 

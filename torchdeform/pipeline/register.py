@@ -28,7 +28,7 @@ from torchdeform.report.command_lines import repeat_command
 from torchdeform.report.figures import write_overview
 from torchdeform.report.page import write_report
 from torchdeform.report.record import describe, write_json
-from torchdeform.report.report_data import make_scene
+from torchdeform.report.report_data import make_report_data
 
 DEVICES = ("auto", "cpu", "cuda")
 RECORD = "result.json"
@@ -249,13 +249,13 @@ def _publish(files: PairFiles, inputs: Inputs, result: RegistrationResult, run: 
     with atomic_folder(out) as folder:
         _write_images(folder, files, inputs, result)
         written = perf_counter()
-        scene = make_scene(inputs.fixed, inputs.moving, result)
-        write_overview(folder / "overview.png", scene)
+        data = make_report_data(inputs.fixed, inputs.moving, result)
+        write_overview(folder / "overview.png", data)
         names = (*sorted([*(path.name for path in folder.iterdir()), REPORT]), RECORD)
         run.seconds.update(result.seconds, write=written - start, draw=perf_counter() - written)
         run.held["draw"] = peak()
         record = _record(files, inputs, result, run) | {"files": names}
-        write_report(folder / REPORT, scene, record)
+        write_report(folder / REPORT, data, record)
         write_json(record, folder / RECORD)
     for name in former - set(names):
         (out / name).unlink(missing_ok=True)

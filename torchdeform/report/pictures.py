@@ -15,7 +15,7 @@ from torchdeform.report.drawing import (
     signed_scale,
     volume_scale,
 )
-from torchdeform.report.report_data import Scene, Slices
+from torchdeform.report.report_data import ReportData, Slices
 from torchdeform.report.web_images import UNITS, Frame, colours, curve, frame_of, grey_levels, grid_paths, sprite, stops
 
 if TYPE_CHECKING:
@@ -47,9 +47,9 @@ class Picture:
         return sum(map(len, self.sprites.values())) + sum(len(p) for paths in self.paths.values() for p in paths)
 
 
-def fitting_pictures(scene: Scene) -> dict[str, object]:
-    """Return what the template needs to show a scene, in the best quality that fits the page."""
-    painters = (_Painter(scene, *size) for size in _SIZES[scene.result.grid.dim])
+def fitting_pictures(data: ReportData) -> dict[str, object]:
+    """Return what the template needs to show a registration, in the best quality that fits the page."""
+    painters = (_Painter(data, *size) for size in _SIZES[data.result.grid.dim])
     painter = next(painters)
     while True:
         pictures = painter.pictures()
@@ -62,27 +62,27 @@ def fitting_pictures(scene: Scene) -> dict[str, object]:
         "planes": planes,
         "wide": round(sum(plane["shape"] for plane in planes), 3),
         "data": {plane["name"]: {key: plane[key] for key in ("positions", "labels")} for plane in planes},
-        "choices": [{"name": name, "title": title} for name, title in _others(scene).items()],
+        "choices": [{"name": name, "title": title} for name, title in _others(data).items()],
         "differences": pictures.pop("Differences"),
         "groups": pictures,
-        "curves": _curves(scene),
+        "curves": _curves(data),
         "dense": len(planes) > 1,
     }
 
 
-def _others(scene: Scene) -> dict[str, str]:
+def _others(data: ReportData) -> dict[str, str]:
     """Return what the fixed image can be compared with."""
-    aligned = scene.result.affine is not None
+    aligned = data.result.affine is not None
     titles = {"warped": "warped", "moving": "moving, aligned" if aligned else "moving", "original": "moving, as it was"}
-    return {name: title for name, title in titles.items() if name in scene.slices[0].fields}
+    return {name: title for name, title in titles.items() if name in data.slices[0].fields}
 
 
 class _Painter:
-    """Paints a scene's slices in one size and quality."""
+    """Paints the slices in one size and quality."""
 
-    def __init__(self, scene: Scene, largest: int, quality: int) -> None:
-        self._scene, self._quality = scene, quality
-        self._parts = [(cuts, frame_of(cuts.plane, len(cuts.numbers), largest)) for cuts in scene.slices]
+    def __init__(self, data: ReportData, largest: int, quality: int) -> None:
+        self._data, self._quality = data, quality
+        self._parts = [(cuts, frame_of(cuts.plane, len(cuts.numbers), largest)) for cuts in data.slices]
 
     def planes(self) -> list[dict[str, Any]]:
         """Return what the page knows of each plane."""
@@ -90,8 +90,8 @@ class _Painter:
 
     def pictures(self) -> dict[str, list[Picture]]:
         """Return all pictures, in groups."""
-        scale = difference_scale(self._scene.limits["before"])
-        titles = {"fixed": "fixed", **_others(self._scene)}
+        scale = difference_scale(self._data.limits["before"])
+        titles = {"fixed": "fixed", **_others(self._data)}
         return {
             "Differences": [
                 self._map("before", "Difference before the deformation", scale),
@@ -105,7 +105,7 @@ class _Painter:
         }
 
     def _maps(self) -> Iterator[Picture]:
-        limits, dim = self._scene.limits, self._scene.result.grid.dim
+        limits, dim = self._data.limits, self._data.result.grid.dim
         paths = {cuts.plane.name: grid_paths(cuts, frame, _GRID_LINES[dim]) for cuts, frame in self._parts}
         yield Picture("grid", "Grid moved by the map", _ABOUT["grid"], paths=paths)
         yield self._map("log_det", "Volume: moving / fixed", volume_scale(limits["log_det"]))
@@ -161,19 +161,19 @@ def _plane(cuts: Slices, frame: Frame) -> dict[str, Any]:
     }
 
 
-def _curves(scene: Scene) -> list[dict[str, object]]:
+def _curves(data: ReportData) -> list[dict[str, object]]:
     """Return the histogram of volumes, and the similarity over the steps."""
     from markupsafe import Markup
 
     def volumes(axes: "Axes") -> None:
-        draw_volumes(axes, scene.volumes, scene.limits["log_det"])
+        draw_volumes(axes, data.volumes, data.limits["log_det"])
 
     def convergence(axes: "Axes") -> None:
-        draw_convergence(axes, scene.result)
+        draw_convergence(axes, data.result)
 
     about = {
         "Volumes": ("How often each change of volume occurs, over all voxels.", volumes),
-        "Convergence": (f"Similarity ({measure_name(scene.result)}) over the steps, by level.", convergence),
+        "Convergence": (f"Similarity ({measure_name(data.result)}) over the steps, by level.", convergence),
     }
     return [
         {"title": title, "caption": caption, "svg": Markup(curve(title, draw, *_CURVE_INCHES))}
