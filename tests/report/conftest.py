@@ -30,7 +30,7 @@ def _closed_figures() -> Iterator[None]:
 
 @pytest.fixture
 def make_full(make_image, make_result) -> Callable[..., tuple[ReportData, dict[str, Any]]]:
-    """Return ``make_full(dim)``: the data of a report and a record with an alignment, labels, landmarks, warnings and commands."""
+    """Return ``make_full(dim)``: the data of a report, and a record with everything in it."""
 
     def make(dim: int, *, labels: int = 3, landmarks: int = 4, **images: Any) -> tuple[ReportData, dict[str, Any]]:
         shape = images.pop("shape", SHAPES[dim])

@@ -14,7 +14,7 @@ from torchdeform.core.image import Image
 from torchdeform.report import make_report_data, write_report
 from torchdeform.report.pictures import fitting_pictures
 from torchdeform.report.record import describe, write_json
-from torchdeform.report.web_images import frame_of, sprite
+from torchdeform.report.web_images import frame_of, image_strip
 
 FRAMES = {2: 4, 3: 10}
 VOID = {"meta", "link", "br", "img", "input", "hr", "path", "use", "rect"}
@@ -172,7 +172,7 @@ def test_a_sprite_holds_the_slices_upright(make_image, make_result):
     frame = frame_of(cuts.plane, 3, 200)
     pixels = np.zeros((3, *cuts.plane.shape, 1), dtype=np.uint8)
     pixels[1, -6:, :6] = 255
-    data = base64.b64decode(sprite(pixels, cuts.plane, frame, 90).partition(",")[2])
+    data = base64.b64decode(image_strip(pixels, cuts.plane, frame, 90).partition(",")[2])
     sheet = np.asarray(Picture.open(io.BytesIO(data)))
     assert sheet.shape == (3 * frame.pitch, frame.across)
     down, across = (values.mean() for values in np.nonzero(sheet > 128))

@@ -16,7 +16,17 @@ from torchdeform.report.drawing import (
     volume_scale,
 )
 from torchdeform.report.report_data import ReportData, Slices
-from torchdeform.report.web_images import UNITS, Frame, colours, curve, frame_of, grey_levels, grid_paths, sprite, stops
+from torchdeform.report.web_images import (
+    UNITS,
+    Frame,
+    colours,
+    curve,
+    frame_of,
+    grey_levels,
+    grid_paths,
+    image_strip,
+    stops,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,18 +35,18 @@ if TYPE_CHECKING:
 _SIZES = {2: ((900, 88), (700, 80), (500, 70), (350, 50)), 3: ((256, 85), (224, 75), (192, 60), (144, 40))}
 _MOST = 4_200_000  # characters of all pictures together
 _GRID_LINES = {2: 40, 3: 28}
-_CURL = {2: "Curl", 3: "Length of the curl"}
+
 _CURVE_INCHES = (5.2, 2.5)
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One figure of the page, as sprites or as paths of lines by plane, and what it means."""
+    """One figure of the page, as strips or as paths of lines by plane, and what it means."""
 
     name: str
     title: str
     caption: str
-    sprites: Mapping[str, str] = field(default_factory=dict)
+    strips: Mapping[str, str] = field(default_factory=dict)
     paths: Mapping[str, list[str]] = field(default_factory=dict)
     bar: str = ""
     ticks: tuple[Mapping[str, object], ...] = ()
@@ -44,7 +54,7 @@ class Picture:
     @property
     def size(self) -> int:
         """Characters on the page."""
-        return sum(map(len, self.sprites.values())) + sum(len(p) for paths in self.paths.values() for p in paths)
+        return sum(map(len, self.strips.values())) + sum(len(p) for paths in self.paths.values() for p in paths)
 
 
 def fitting_pictures(data: ReportData) -> dict[str, object]:
@@ -98,7 +108,7 @@ class _Painter:
                 self._map("after", "Difference after it", scale),
             ],
             "Images": [
-                Picture(name, title.capitalize(), _ABOUT[name], self._sprites(name, None))
+                Picture(name, title.capitalize(), _ABOUT[name], self._strips(name, None))
                 for name, title in titles.items()
             ],
             "The map": list(self._maps()),
@@ -121,15 +131,15 @@ class _Painter:
             {"place": round(100 * (value - scale.low) / (scale.high - scale.low), 2), "text": text}
             for value, text in scale.ticks
         )
-        return Picture(name, title, _ABOUT[name], self._sprites(name, scale), bar=stops(scale), ticks=ticks)
+        return Picture(name, title, _ABOUT[name], self._strips(name, scale), bar=stops(scale), ticks=ticks)
 
-    def _sprites(self, name: str, scale: Scale | None) -> dict[str, str]:
+    def _strips(self, name: str, scale: Scale | None) -> dict[str, str]:
         """Return a field's slices of every plane as data URIs."""
         found = {}
         for cuts, frame in self._parts:
             values = cuts.fields[name]
             pixels = grey_levels(values) if scale is None else colours(values, scale)
-            found[cuts.plane.name] = sprite(pixels, cuts.plane, frame, self._quality)
+            found[cuts.plane.name] = image_strip(pixels, cuts.plane, frame, self._quality)
         return found
 
 
