@@ -204,9 +204,9 @@ def test_wrong_places_and_dimensions_are_one_sentence(tmp_path, make_image):
     with pytest.raises(InputError, match="holds 3D points, but 2D is needed"):
         read_points(path, make_image((8, 8)))
     flat = _write(tmp_path, "flat.csv", "x,y\n1,2\n")
-    with pytest.raises(InputError, match="points of 2D, but 3D is needed"):
+    with pytest.raises(InputError, match="holds 2D points, but 3D is needed"):
         read_points(flat, dim=3)
-    with pytest.raises(InputError, match="points of 2D, but image is 3D"):
+    with pytest.raises(InputError, match="holds 2D points, but image is 3D"):
         read_points(_write(tmp_path, "v.csv", "i,j\n1,2\n"), make_image((8, 8, 8)), dim=2)
     with pytest.raises(InputError, match="no ending that points are written with"):
         write_points(_points(), tmp_path / "p.xyz")
