@@ -205,7 +205,7 @@ def quantiles(values: Tensor, *percent: float) -> list[float]:
     """Return percentiles of at most about a million values, taken at regular steps."""
     flat = values.reshape(-1)
     some = flat[:: 1 + flat.numel() // 2**20]
-    finite = some[some.isfinite()]
+    finite = some[some.isfinite()].cpu()
     return [float(q) for q in np.percentile(finite.numpy(), percent)] if len(finite) else [0.0] * len(percent)
 
 
