@@ -80,23 +80,48 @@ def test_the_short_command_has_a_short_example(screen, capsys):
     assert len(out.strip("\n").splitlines()) <= LINES
 
 
-def test_one_name_for_one_thing(capsys):
-    """An option of two verbs has one meaning: one placeholder, whether it is a flag or takes a value."""
-    kinds: dict[str, set[str]] = {}
-    for verb in VERBS:
-        assert torchdeform([verb, "--help"]) == 0
-        for name, kind in re.findall(r"│ (?:\*  )?(--[a-z-]+) +([A-Z=]*)", capsys.readouterr().out):
-            kinds.setdefault(name, set()).add(kind)
-    several = {name: kind for name, kind in kinds.items() if len(kind) > 1}
-    assert set(several) <= {"--out", "--reference"}  # a file or a folder; the metavar says which
-
-
 def test_version_names_what_results_depend_on(capsys):
     assert torchdeform(["--version"]) == 0
     out = capsys.readouterr().out.strip()
     assert re.fullmatch(
         rf"torchdeform {re.escape(__version__)}, torch {re.escape(torch.__version__)}, (cpu|cuda .+)", out
     )
+
+
+def fresh(code: str, **variables: str) -> str:
+    """Return what a fresh interpreter prints, in a pipe."""
+    inherited = {name: value for name, value in os.environ.items() if name not in ("FORCE_COLOR", "PY_COLORS")}
+    command = [sys.executable, "-c", f"import sys; from torchdeform.cli.main import torchdeform; {code}"]
+    done = subprocess.run(command, env={**inherited, **variables}, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
+
+
+def test_completion_is_printed():
+    script = fresh("sys.exit(torchdeform(['--show-completion', 'bash']))")
+    assert "complete -o default -F _torchdeform_completion torchdeform" in script
+
+
+def test_no_colours_in_a_pipe(folder):
+    lines = [["--help"], ["register", "--help"], ["check", "fixed.nii.gz", "moving.nii.gz"], ["check", "no.png", "x"]]
+    text = fresh(f"[torchdeform(words) for words in {lines!r}]")
+    assert "no.png" in text
+    assert "\x1b[" not in text
+
+
+@pytest.mark.parametrize("program", [main, torchdeform])
+def test_version_and_help(program, capsys):
+    assert program(["--version"]) == 0
+    assert capsys.readouterr().out.startswith(f"torchdeform {__version__}, torch {torch.__version__}, ")
+    assert program(["--help"]) == 0
+    assert "Usage" in capsys.readouterr().out
+
+
+def test_no_command_shows_the_help(capsys):
+    assert torchdeform([]) == 2
+    out, err = capsys.readouterr()
+    assert "register" in out + err
+    assert "Traceback" not in out + err
 
 
 RECORDS = {
@@ -132,29 +157,8 @@ def test_an_error_is_no_record(folder, capsys):
     assert err.count("\n") == 1
 
 
-def fresh(code: str, **variables: str) -> str:
-    """Return what a fresh interpreter prints, in a pipe."""
-    inherited = {name: value for name, value in os.environ.items() if name not in ("FORCE_COLOR", "PY_COLORS")}
-    command = [sys.executable, "-c", f"import sys; from torchdeform.cli.main import torchdeform; {code}"]
-    done = subprocess.run(command, env={**inherited, **variables}, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout + done.stderr
-
-
-def test_completion_is_printed():
-    script = fresh("sys.exit(torchdeform(['--show-completion', 'bash']))")
-    assert "complete -o default -F _torchdeform_completion torchdeform" in script
-
-
 def test_completion_knows_values():
     """What bash asks when the tab key is pressed."""
     line = {"COMP_WORDS": "torchdeform register --preset ", "COMP_CWORD": "3"}
     found = fresh("sys.exit(torchdeform())", _TORCHDEFORM_COMPLETE="complete_bash", **line)
     assert found.split() == preset_names()
-
-
-def test_no_colours_in_a_pipe(folder):
-    lines = [["--help"], ["register", "--help"], ["check", "fixed.nii.gz", "moving.nii.gz"], ["check", "no.png", "x"]]
-    text = fresh(f"[torchdeform(words) for words in {lines!r}]")
-    assert "no.png" in text
-    assert "\x1b[" not in text

@@ -12,7 +12,6 @@ import pytest
 import SimpleITK as sitk
 import torch
 
-from torchdeform import __version__
 from torchdeform.cli.main import main, torchdeform
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, resample
@@ -212,21 +211,6 @@ def test_cuda_asked_for_in_vain(folder, engine, capsys, monkeypatch):
 def test_a_folder_without_permission_is_named(folder, engine, capsys):
     (folder / "locked").mkdir(mode=0o500)
     assert "cannot write to locked" in _fails(capsys, 2, "fixed.png", "moving.png", "--out", "locked/out")
-
-
-@pytest.mark.parametrize("program", [main, torchdeform])
-def test_version_and_help(program, capsys):
-    assert program(["--version"]) == 0
-    assert capsys.readouterr().out.startswith(f"torchdeform {__version__}, torch {torch.__version__}, ")
-    assert program(["--help"]) == 0
-    assert "Usage" in capsys.readouterr().out
-
-
-def test_no_command_shows_the_help(capsys):
-    assert torchdeform([]) == 2
-    out, err = capsys.readouterr()
-    assert "register" in out + err
-    assert "Traceback" not in out + err
 
 
 def test_help_names_every_option(capsys):

@@ -5,7 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from torchdeform.cohort.plan import Job
 from torchdeform.cohort.schema import Cohort, read_cohort
+from torchdeform.io import write_image
+from torchdeform.pipeline.register import PairFiles
+from torchdeform.registration.settings import RegistrationSettings
 
 
 @pytest.fixture
@@ -32,3 +36,23 @@ def cohort_of(tmp_path) -> Callable[[str], Cohort]:
         return read_cohort(path)
 
     return read
+
+
+FAST = RegistrationSettings(align="none", similarity="ssd", steps=(2,), length=8.0)
+
+
+@pytest.fixture
+def jobs(tmp_path, make_image) -> list[Job]:
+    """Four pairs of small images."""
+    paths = [tmp_path / "fixed.png", tmp_path / "moving.png"]
+    for path, shift in zip(paths, (0.0, 3.0), strict=True):
+        write_image(make_image((16, 16), origin=(shift, 0.0), pixel_type="uint8"), path)
+    return [
+        Job(
+            name=name,
+            files=PairFiles(fixed=paths[0], moving=paths[1], out=tmp_path / "out" / name),
+            settings=FAST,
+            device="cpu",
+        )
+        for name in "abcd"
+    ]

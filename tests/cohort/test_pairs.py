@@ -1,23 +1,13 @@
-"""Where pairs come from: which files are found, who is paired with whom, what goes along, and what is refused."""
+"""Where pairs come from: who is paired with whom, what goes along, and what is refused."""
 
-import json
 import re
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from cohort_files import BIDS
 
-from torchdeform.cohort.learn2reg import submission_name
-from torchdeform.cohort.names import clean, image_name, pair_name, select
 from torchdeform.cohort.pairs import find_images, named_images, pair_specs
-from torchdeform.cohort.patterns import fill, find, literal, only, part_names
 from torchdeform.errors import InputError
 
-_BIDS = [
-    f"sub-{subject}/ses-{session}/anat/sub-{subject}_ses-{session}_T1w.nii.gz"
-    for subject in ("01", "02")
-    for session in (1, 2, 10)
-]
 _FILES = "'sub-{subject}/ses-{session}/anat/*_T1w.nii.gz'"
 
 
@@ -35,67 +25,8 @@ def _table(folder, text, name="pairs.csv"):
     return f"pairs:\n  table: {{file: {name}}}\n"
 
 
-# Patterns
-
-
-def test_parts_are_found_and_sorted_by_their_numbers(touch):
-    folder = touch([*_BIDS, "sub-01/ses-1/anat/sub-01_T2w.nii.gz", "sub-03/anat/x_T1w.nii.gz"])
-    found = find(f"{folder}/sub-{{subject}}/ses-{{session}}/anat/*_T1w.nii.gz", {})
-    assert [one.parts["subject"] + "/" + one.parts["session"] for one in found] == [
-        "01/1", "01/2", "01/10", "02/1", "02/2", "02/10",
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("pattern", "names"),
-    [
-        ("*.png", ["a1.png", "a2.png", "b1.png"]),
-        ("?1.png", ["a1.png", "b1.png"]),
-        ("[!a]?.png", ["b1.png"]),
-        ("[ab]2.png", ["a2.png"]),
-        ("**/*.tif", ["c.tif", "d.tif"]),
-        ("{x}/{x}.jpg", ["e.jpg"]),
-        ("{x}.pn", []),
-        (".*", [".hidden.png"]),
-    ],
-)
-def test_patterns_are_those_of_a_shell(touch, pattern, names):
-    folder = touch(["a1.png", "a2.png", "b1.png", "c.tif", "deep/er/d.tif", "e/e.jpg", "e/f.jpg", ".hidden.png"])
-    assert [one.path.name for one in find(f"{folder}/{pattern}", {})] == names
-
-
-def test_a_part_may_be_limited(touch):
-    folder = touch(["s1.png", "s1_label.png", "sx.png"])
-    assert [one.parts for one in find(f"{folder}/s{{n}}.png", {"n": "[0-9]+"})] == [{"n": "1"}]
-    with pytest.raises(InputError, match="makes no regular expression"):
-        find(f"{folder}/s{{n}}.png", {"n": "(?P<n>x)"})
-
-
-@given(st.text(alphabet="ab*?[]{}!-.", min_size=1, max_size=8))
-def test_literal_means_the_text_itself(text):
-    assert only(f"/{literal(text)}").as_posix() == f"/{text}" or text.strip(".") == ""
-    assert part_names(literal(text)) == ()
-
-
-@given(st.text(alphabet="ab*?[{}", min_size=1, max_size=6))
-def test_what_is_filled_in_is_taken_literally(text):
-    assert only(fill("/x{part}.png", {"part": text})).as_posix() == f"/x{text}.png"
-
-
-def test_one_file_must_match(touch):
-    folder = touch(["a1.png", "a2.png"])
-    assert only(f"{folder}/a1*").name == "a1.png"
-    with pytest.raises(InputError, match="must match one file, and 2 files match"):
-        only(f"{folder}/a*")
-    with pytest.raises(InputError, match="must match one file, and no file matches"):
-        only(f"{folder}/b*")
-
-
-# Pairings
-
-
 def test_consecutive_sessions_within_each_subject(touch, cohort_of):
-    touch(_BIDS)
+    touch(BIDS)
     found = pair_specs(cohort_of(f"pairs: {{pattern: {{files: {_FILES}, pairing: consecutive, within: [subject]}}}}\n"))
     assert _pairs(found) == [(_session(a, s), _session(b, s)) for s in ("01", "02") for a, b in ((1, 2), (2, 10))]
     assert found[0].name == "sub-01_from-ses2_to-ses1"
@@ -117,7 +48,7 @@ def test_every_two(touch, cohort_of, both, count):
 
 
 def test_each_to_a_member_of_its_group(touch, cohort_of):
-    touch([*_BIDS, "sub-03/ses-2/anat/sub-03_ses-2_T1w.nii.gz"])
+    touch([*BIDS, "sub-03/ses-2/anat/sub-03_ses-2_T1w.nii.gz"])
     text = f"files: {_FILES}, pairing: group, within: [subject], reference: {{session: '1'}}"
     *found, lonely = pair_specs(cohort_of(f"pairs: {{pattern: {{{text}}}}}\n"))
     assert _pairs(found) == [(_session(1, s), _session(k, s)) for s in ("01", "02") for k in (2, 10)]
@@ -138,7 +69,7 @@ def test_all_to_a_template_but_itself(touch, cohort_of):
 
 
 def test_a_template_of_each_subject(touch, cohort_of):
-    touch(_BIDS)
+    touch(BIDS)
     text = f"files: {_FILES}, pairing: template, fixed: 'sub-{{subject}}/base.nii.gz'"
     found = pair_specs(cohort_of(f"pairs: {{pattern: {{{text}}}}}\n"))
     assert {pair.files["fixed"].parent.name for pair in found} == {"sub-01", "sub-02"}
@@ -183,9 +114,6 @@ def test_several_patterns_and_plain_files(touch, cohort_of):
     touch(["a/1.png", "b/2.png", "a/3.png"])
     found = find_images(cohort_of("images: {files: [a/1.png, 'b/*.png', 'a/*.png']}\n").images)
     assert [one.path.name for one in found] == ["1.png", "2.png", "3.png"]
-
-
-# Lists and tables
 
 
 def test_listed_pairs_keep_their_order_and_names(cohort_of):
@@ -245,103 +173,6 @@ def test_files_that_are_no_table(cohort_of, tmp_path):
     (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="is no text"):
         pair_specs(cohort_of("pairs: {table: {file: binary.csv}}\n"))
-
-
-# Learn2Reg
-
-
-def _dataset(folder, **content):
-    one, two = ("./imagesTr/Lung_0001_0000.nii.gz", "./imagesTr/Lung_0001_0001.nii.gz")
-    beside = {key: f"./{key}sTr/Lung_0001_0000" for key in ("label", "mask", "keypoints", "landmarks")}
-    whole = {
-        "name": "Lung",
-        "training": [{"image": one, **beside}, {"image": two, "mask": "./m1", "landmarks": "./l1"}],
-        "test": ["./imagesTs/Lung_0002_0000.nii.gz"],
-        "training_paired_images": [{"fixed": one, "moving": two}],
-        "registration_val": [{"fixed": one, "moving": two}, {"fixed": two, "moving": one}],
-        **content,
-    }
-    (folder / "Lung_dataset.json").write_text(json.dumps(whole), encoding="utf-8")
-
-
-def test_learn2reg_pairs_with_what_both_images_have(cohort_of, tmp_path):
-    _dataset(tmp_path)
-    found = pair_specs(cohort_of("pairs: {learn2reg: {file: Lung_dataset.json}}\n"))
-    assert len(found) == 2
-    assert found[0].files == {
-        "fixed": tmp_path / "imagesTr/Lung_0001_0000.nii.gz",
-        "moving": tmp_path / "imagesTr/Lung_0001_0001.nii.gz",
-        "fixed_mask": tmp_path / "masksTr/Lung_0001_0000",
-        "moving_mask": tmp_path / "m1",
-        "fixed_points": tmp_path / "landmarkssTr/Lung_0001_0000",
-        "moving_points": tmp_path / "l1",
-    }
-    assert len(pair_specs(cohort_of("pairs: {learn2reg: {file: Lung_dataset.json, split: train}}\n"))) == 1
-
-
-@pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
-        ({"registration_val": []}, "names no pairs for the split val"),
-        ({"registration_val": "x"}, "names no pairs for the split val"),
-        ({"registration_val": [{"fixed": "a"}]}, r"registration_val\[0\] must name a fixed and a moving image"),
-        ({"registration_val": [5]}, "must name a fixed and a moving image"),
-    ],
-)
-def test_wrong_data_sets(cohort_of, tmp_path, content, sentence):
-    _dataset(tmp_path, **content)
-    with pytest.raises(InputError, match=sentence):
-        pair_specs(cohort_of("pairs: {learn2reg: {file: Lung_dataset.json}}\n"))
-
-
-@pytest.mark.parametrize(
-    ("text", "sentence"), [("{", "is no valid JSON"), ("[]", "no data set"), (None, "No such file")]
-)
-def test_files_that_are_no_data_set(cohort_of, tmp_path, text, sentence):
-    if text is not None:
-        (tmp_path / "d.json").write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=sentence):
-        pair_specs(cohort_of("pairs: {learn2reg: {file: d.json}}\n"))
-
-
-@pytest.mark.parametrize(
-    ("fixed", "moving", "name"),
-    [
-        ("A_0001_0000.nii.gz", "A_0002_0000.nii.gz", "disp_0001_0002.nii.gz"),
-        ("A_0001_0000.nii.gz", "A_0001_0001.nii.gz", "disp_0001_0001.nii.gz"),
-        ("A_0001_0001.nii.gz", "A_0001_0000.nii.gz", "disp_0001_0001_0001_0000.nii.gz"),
-        ("A_0001_0000.nii.gz", "A_0001_0002.nii.gz", "disp_0001_0000_0001_0002.nii.gz"),
-    ],
-)
-def test_submissions_are_called_as_the_evaluation_looks_for_them(tmp_path, fixed, moving, name):
-    assert submission_name(tmp_path / fixed, tmp_path / moving) == name
-
-
-def test_other_names_cannot_be_submitted(tmp_path):
-    with pytest.raises(InputError, match=r"must end in _CASE_MODALITY.nii.gz"):
-        submission_name(tmp_path / "a.nii.gz", tmp_path / "A_0001_0000.nii.gz")
-
-
-# Names
-
-
-@given(st.text(max_size=300), st.text(max_size=300))
-def test_names_made_of_anything_stay_in_their_folder(tmp_path_factory, one, other):
-    root = tmp_path_factory.getbasetemp()
-    fixed, moving = root / "f.png", root / "m.png"
-    for name in (clean(one), image_name(fixed, {"subject": one}), pair_name(fixed, moving, {"a": one}, {"a": other})):
-        assert re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,299}", name)
-
-
-def test_selection_is_by_name_beginning_or_pattern():
-    names = ["sub-1", "sub-1_ses-2", "sub-10", "sub-2_ses-1"]
-    assert select(names, "sub-1") == names[:2]
-    assert select(names, "sub-1*") == names[:3]
-    assert select(names, "*_ses-?") == [names[1], names[3]]
-    assert select(names, "sub") == []
-
-
-# Images of a template
 
 
 def test_images_of_a_template_are_named(touch, cohort_of):

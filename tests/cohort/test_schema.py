@@ -6,11 +6,12 @@ import pytest
 
 from torchdeform.cli.main import torchdeform
 from torchdeform.cohort.schema import Cohort, cohort_schema, read_cohort
-from torchdeform.cohort.settings import expand
 from torchdeform.errors import InputError
-from torchdeform.pipeline.config import configs_folder, load_settings, read_yaml_lines
+from torchdeform.pipeline.config import configs_folder, load_settings
 
 _LIST = "pairs:\n  list:\n    - fixed: a.png\n      moving: b.png\n"
+
+
 _PATTERN = "pairs:\n  pattern:\n    files: '{subject}.png'\n    pairing: all\n"
 
 
@@ -125,22 +126,6 @@ def test_aliases_without_end_are_refused(cohort_of):
         cohort_of("pairs: &p {list: [*p]}\n")
 
 
-def test_lines_of_keys(tmp_path):
-    path = tmp_path / "a.yaml"
-    path.write_text("a: &b\n  c: 1\nd:\n  - e\n  - <<: *b\n    f: 2\n", encoding="utf-8")
-    lines = read_yaml_lines(path)
-    assert lines[("a",)] == 1
-    assert lines[("a", "c")] == 2
-    assert lines[("d", 1)] == 5
-    assert lines[("d", 1, "f")] == 6
-    assert lines[("d", 1, "c")] == 2
-
-
-def test_expanding_leaves_other_text_alone(monkeypatch):
-    monkeypatch.setenv("A", "b")
-    assert expand("x/$A/${A}_{part}*[c]") == "x/b/b_{part}*[c]"
-
-
 def test_schema_knows_every_key_and_the_settings(tmp_path):
     schema = cohort_schema()
     assert set(schema["properties"]) == set(Cohort.model_fields)
@@ -152,11 +137,6 @@ def test_schema_knows_every_key_and_the_settings(tmp_path):
             assert "description" in field or "$ref" in field or definition is not schema, name
     assert torchdeform(["schema", "--out", str(tmp_path / "new" / "schema.json")]) == 0
     assert json.loads((tmp_path / "new" / "schema.json").read_text(encoding="utf-8")) == schema
-
-
-def test_schema_goes_to_standard_output(capsys):
-    assert torchdeform(["schema"]) == 0
-    assert json.loads(capsys.readouterr().out) == cohort_schema()
 
 
 @pytest.mark.parametrize("path", sorted(configs_folder().glob("cohort_*.yaml")), ids=lambda path: path.stem)

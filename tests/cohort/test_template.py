@@ -1,56 +1,19 @@
 """A template of files: what is written, that it is what the library makes, going on after a stop, broken images."""
 
 import json
-import math
 import os
-import re
 from pathlib import Path
 
 import pytest
 import torch
+from cohort_files import GRID, cohort, write_images
 
-from torchdeform.cli.main import torchdeform
-from torchdeform.cohort.schema import Cohort, read_cohort
+from torchdeform.cohort.schema import read_cohort
 from torchdeform.cohort.settings import TemplateSettings
 from torchdeform.cohort.template import Built, build
-from torchdeform.core.flow import integrate
-from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image
-from torchdeform.core.warp import warp
 from torchdeform.errors import ComputationError, InputError
-from torchdeform.io import read_image, read_labels, read_transform, write_image, write_labels
+from torchdeform.io import read_image, read_labels, read_transform
 from torchdeform.registration.template import AveragingSettings, build_template
-
-GRID = Grid((32, 36))
-COHORT = """
-out: out
-images:
-  files: images/sub-{{subject}}.nii.gz
-  labels: images/labels-{{subject}}.nii.gz
-settings: {{align: none, steps: [30, 10], length: 12, window: 5}}
-template: {{rounds: {rounds}, {more}}}
-engine: {{workers: 1, threads: 1}}
-"""
-
-
-def write_images(folder: Path, count: int = 3) -> None:
-    """Write warps of one picture, whose flows have the mean 0, and of its regions."""
-    unit = GRID.points() / GRID.along(GRID.extent, GRID.points())
-    fade = torch.sin(math.pi * unit).prod(1, keepdim=True)
-    values = (torch.cos(9 * unit + 5 * unit.flip(1) ** 2).sum(1, keepdim=True) + 2) * 40 * (3 * fade).clamp(max=1)
-    regions = (values > 80).float()
-    for i in range(count):
-        turn = 2 * math.pi * i / count
-        v = 2.5 * fade * torch.tensor([math.cos(turn), math.sin(turn)]).view(1, 2, 1, 1)
-        u = integrate(v, GRID)
-        write_image(Image(warp(values, u, GRID), GRID), folder / f"sub-{i}.nii.gz")
-        write_labels(Image(warp(regions, u, GRID, mode="nearest"), GRID), folder / f"labels-{i}.nii.gz")
-
-
-def cohort(folder: Path, rounds: int = 2, more: str = "pose: reference") -> Cohort:
-    path = folder / "template.yaml"
-    path.write_text(COHORT.format(rounds=rounds, more=more), encoding="utf-8")
-    return read_cohort(path)
 
 
 @pytest.fixture(scope="module")
@@ -115,21 +78,6 @@ def test_what_a_stop_left_undone_is_done_the_same(built):
         build(cohort(built.folder.parent))
         assert lost.is_file()
         assert torch.equal(read_image(template).data, wanted)
-
-
-def test_a_broken_image_is_left_out_and_the_shell_says_so(tmp_path, capsys):
-    write_images(tmp_path / "images", 4)
-    broken = tmp_path / "images" / "sub-2.nii.gz"
-    broken.write_bytes(broken.read_bytes()[:60])
-    cohort(tmp_path, rounds=1, more="match_intensities: false")
-    assert torchdeform(["template", str(tmp_path / "template.yaml")]) == 1
-    out, err = capsys.readouterr()
-    assert "3, 1 left out" in out
-    assert "without sub-2" in err
-    assert re.search(r"round 1 of 1.*sub-2 failed: .*sub-2\.nii\.gz", err)
-    record = json.loads((tmp_path / "out" / "result.json").read_text())
-    assert record["left_out"].keys() == {"sub-2"}
-    assert record["images"].keys() == {"sub-0", "sub-1", "sub-3"}
 
 
 def test_a_reference_that_cannot_be_read_ends_it_with_the_reason(tmp_path):

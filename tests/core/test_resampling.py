@@ -1,5 +1,6 @@
 """Banded matrices against torch's own interpolation, padding and convolution, and against the dense matrix."""
 
+from itertools import pairwise
 from unittest import mock
 
 import pytest
@@ -10,7 +11,23 @@ from hypothesis import strategies as st
 from torch.autograd import gradcheck
 
 import torchdeform.core.resampling as module
-from torchdeform.core.resampling import banded, gathering, interpolation, multiply, restriction
+from torchdeform.core.grid import Grid
+from torchdeform.core.resampling import (
+    MIN_NODES,
+    Transfer,
+    banded,
+    box_spread,
+    box_sum,
+    centres,
+    gathering,
+    interpolation,
+    multiply,
+    prolong,
+    pyramid_grids,
+    restrict,
+    restriction,
+    thinned,
+)
 
 LIKE = torch.zeros(0, dtype=torch.float64)
 
@@ -65,3 +82,104 @@ def test_restriction_smooths_and_interpolates(fine, coarse):
     torch.testing.assert_close(applied(restriction(fine, coarse, 0.5, LIKE), line), expected)
     flat = applied(restriction(fine, coarse, 0.5, LIKE), torch.ones(fine, dtype=torch.float64))
     torch.testing.assert_close(flat, torch.ones(coarse, dtype=torch.float64))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.integers(3, 14), min_size=2, max_size=3), st.sampled_from([3, 5, 7, 9]), st.integers(0, 99))
+def test_box_sum_counts_the_window_and_is_self_adjoint(shape, window, seed):
+    generator = torch.Generator().manual_seed(seed)
+    x, y = torch.rand(2, 1, 2, *shape, generator=generator, dtype=torch.float64)
+    node = tuple(int(torch.randint(n, (), generator=generator)) for n in shape)
+    cut = (..., *(slice(max(0, i - window // 2), i + window // 2 + 1) for i in node))
+    torch.testing.assert_close(box_sum(x, window)[(..., *node)], x[cut].flatten(2).sum(2))
+    torch.testing.assert_close((box_sum(x, window) * y).sum(), (x * box_sum(y, window)).sum())
+
+
+def test_box_sum_is_the_same_on_long_axes():
+    x = torch.rand(1, 1, 600, 20, dtype=torch.float64)
+    torch.testing.assert_close(box_sum(x, 9)[:, :, 100:200], box_sum(x[:, :, 90:210].contiguous(), 9)[:, :, 10:110])
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.lists(st.sampled_from([3, 4, 7, 10, 13, 530]), min_size=2, max_size=3).filter(
+        lambda shape: shape.count(530) < 2
+    ),
+    st.sampled_from([3, 5, 9]),
+    st.integers(1, 4),
+    st.integers(0, 99),
+)
+def test_with_a_stride_windows_are_left_out_and_the_transpose_is_one(shape, window, stride, seed):
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.rand(1, 2, *shape, generator=generator, dtype=torch.float64)
+    few = box_sum(x, window, stride)
+    torch.testing.assert_close(few, centres(box_sum(x, window), stride))
+    y = torch.rand(few.shape, generator=generator, dtype=torch.float64)
+    torch.testing.assert_close((few * y).sum(), (x * box_spread(y, window, stride, tuple(shape))).sum())
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(st.integers(8, 90), st.floats(0.2, 5)), min_size=2, max_size=3), st.integers(1, 6))
+def test_every_level_spans_the_same_box(axes, levels):
+    grid = Grid(tuple(n for n, _ in axes), tuple(h for _, h in axes))
+    grids = pyramid_grids(grid, levels)
+    assert grids[-1] == grid
+    assert len(grids) <= levels
+    for coarse, fine in pairwise(grids):
+        assert coarse.shape != fine.shape
+        assert all(MIN_NODES <= a <= b for a, b in zip(coarse.shape, fine.shape, strict=True))
+        assert coarse.extent == pytest.approx(grid.extent)
+
+
+def test_thick_slices_are_thinned_last():
+    grids = pyramid_grids(Grid((20, 101, 101), (4.0, 1.0, 1.0)), 3)
+    assert [g.shape for g in grids] == [(20, 26, 26), (20, 51, 51), (20, 101, 101)]
+
+
+@pytest.mark.parametrize("shape", [(33, 40), (17, 20, 24)])
+def test_linear_images_and_maps_pass_through_unchanged_inside(shape):
+    grid = Grid(shape, (1.0, 1.5, 0.7)[: len(shape)])
+    coarse = pyramid_grids(grid, 2)[0]
+    x = grid.points(dtype=torch.float64)
+    image = sum((k + 1) * x[:, k : k + 1] for k in range(grid.dim))
+    there = restrict(image, grid, coarse)
+    y = coarse.points(dtype=torch.float64)
+    expected = sum((k + 1) * y[:, k : k + 1] for k in range(grid.dim))
+    inside = (..., *[slice(3, -3)] * grid.dim)
+    torch.testing.assert_close(there[inside], expected[inside])
+    torch.testing.assert_close(prolong(0.1 * y, grid), 0.1 * x)
+
+
+def test_restriction_removes_what_would_alias():
+    grid = Grid((65, 65))
+    checkers = torch.ones(1, 1, 65, 65)
+    checkers[..., ::2, ::2], checkers[..., 1::2, 1::2] = -1.0, -1.0
+    assert restrict(checkers, grid, pyramid_grids(grid, 2)[0])[..., 2:-2, 2:-2].abs().max() < 0.1
+
+
+MODES = {2: "bilinear", 3: "trilinear"}
+
+
+@pytest.fixture(params=[(41, 36), (30, 20, 25), (12, 600)], ids=["2d", "3d", "long"])
+def transfer(request):
+    fine = Grid(request.param, spacing=(1.0, 0.7, 1.3)[: len(request.param)])
+    return Transfer(fine, thinned(fine, 2.0), torch.zeros(1, dtype=torch.float64))
+
+
+def test_up_is_linear_interpolation(transfer):
+    field = torch.rand(2, 3, *transfer.coarse.shape, dtype=torch.float64)
+    expected = F.interpolate(field, transfer.fine.shape, mode=MODES[transfer.fine.dim], align_corners=True)
+    torch.testing.assert_close(transfer.up(field), expected, rtol=0, atol=1e-12)
+
+
+def test_gather_is_the_transpose_per_volume(transfer):
+    field = torch.rand(2, 3, *transfer.coarse.shape, dtype=torch.float64)
+    force = torch.rand(2, 3, *transfer.fine.shape, dtype=torch.float64)
+    work = (transfer.up(field) * force).sum() * transfer.fine.cell_volume
+    torch.testing.assert_close((field * transfer.gather(force)).sum() * transfer.coarse.cell_volume, work)
+
+
+def test_a_constant_force_stays_what_it_is_inside(transfer):
+    inner = (..., *[slice(2, -2)] * transfer.fine.dim)
+    found = transfer.gather(torch.ones(1, 1, *transfer.fine.shape, dtype=torch.float64))[inner]
+    torch.testing.assert_close(found.mean(), torch.ones((), dtype=torch.float64), rtol=0.02, atol=0)

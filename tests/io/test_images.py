@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 import torch
+from broken_files import save, volume
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
@@ -15,6 +16,8 @@ from torchdeform.io import read_image, write_image
 from torchdeform.io.images import ending_like
 
 PICTURES = {".png": (1, 3, 4), ".tif": (1, 3, 4), ".bmp": (3, 4)}
+
+
 VOLUMES = [".nii", ".nii.gz", ".mha", ".mhd", ".nrrd", ".nhdr"]
 
 
@@ -226,3 +229,26 @@ def test_no_place_to_write_is_said(tmp_path, make_image):
 )
 def test_results_are_stored_like_their_source(make_image, moving, kind, channels, ending):
     assert ending_like(Path(moving), make_image((6, 7), channels=channels, pixel_type=kind)) == ending
+
+
+@pytest.mark.parametrize("kind", ["uint8", "int16", "uint16", "int32", "float64"])
+def test_every_kind_of_number_is_read(folder, kind):
+    save(volume(kind), folder / "a.nii.gz")
+    image = read_image("a.nii.gz")
+    assert image.pixel_type == kind
+    np.testing.assert_allclose(image.data[0, 0].numpy(), volume(kind).astype(np.float32))
+
+
+@pytest.mark.parametrize("ending", [".png", ".tif"])
+def test_black_and_white_is_an_image(folder, ending):
+    pil = pytest.importorskip("PIL.Image")
+    values = volume(shape=(30, 40)) > 100
+    pil.fromarray(values).save(folder / f"a{ending}")
+    data = read_image(f"a{ending}").data[0, 0]
+    assert torch.equal(data == data.max(), torch.from_numpy(values))
+
+
+@pytest.mark.parametrize("name", ["absent_mask.nii.gz", "sound.nii"])
+def test_a_mask_that_is_not_there_is_an_error(folder, name):
+    with pytest.raises(InputError, match="does not exist"):
+        read_image(name)

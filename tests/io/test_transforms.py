@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 import torch
+from broken_files import SHAPE, bytes_of, save, volume
 
 from torchdeform.core.image import resample
 from torchdeform.core.transform import Affine, Displacement, Transform
@@ -16,7 +17,11 @@ from torchdeform.io import read_displacement, read_image, write_displacement, wr
 from torchdeform.io.transforms import read_transform
 
 SHAPES = {2: ((40, 52), (45, 38)), 3: ((18, 22, 26), (20, 17, 24))}
+
+
 SPACINGS = {2: ((1.3, 0.7), (0.9, 1.1)), 3: ((2.2, 0.7, 1.1), (1.4, 1.3, 1.2))}
+
+
 ORIGINS = {2: ((-8.0, 120.0), (-12.0, 117.0)), 3: ((-8.0, 120.0, 33.0), (-11.0, 117.0, 32.0))}
 
 
@@ -138,9 +143,6 @@ def test_wrong_fields_are_refused(tmp_path, make_image, make_displacement):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["image.mha", "text.txt"]
 
 
-# --- chains: affine and displacement together ---------------------------------------------------------------------
-
-
 def _affine(dim, centre):
     numbers = torch.randn(dim, dim + 1, dtype=torch.float64, generator=torch.manual_seed(3))
     matrix = torch.eye(dim, dtype=torch.float64) + 0.08 * numbers[:, :-1]
@@ -228,6 +230,8 @@ def test_affine_files(tmp_path, dim, ending):
 
 
 CENTRE, TURN = (10.0, -20.0, 30.0), (0.1, -0.2, 0.3)
+
+
 LINEAR = {
     "identity": lambda dim: sitk.Transform(dim, sitk.sitkIdentity),
     "translation": lambda dim: sitk.TranslationTransform(dim, CENTRE[:dim]),
@@ -340,9 +344,6 @@ def test_other_transforms_are_refused(tmp_path):
         read_transform(tmp_path / "two.tfm")
 
 
-# --- ANTs ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def ants():
     return pytest.importorskip("ants", reason="antspyx is not installed")
@@ -419,3 +420,21 @@ def test_we_get_the_result_of_an_ants_registration(tmp_path, ants, data_folder, 
     points = _world(replace(chains[0], fixed=images[0]), beyond=0.0)
     files = [ways[0]] if composite else ways[0]
     torch.testing.assert_close(chains[0].points(points), _ants_points(ants, dim, points, files), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "make"),
+    [
+        ("image.nii.gz", lambda p: save(volume(), p)),
+        ("short.nii.gz", lambda p: p.write_bytes(bytes_of(".nii.gz")[:300])),
+        ("picture.png", lambda p: save(volume("uint8", (30, 40)), p)),
+        ("two.mha", lambda p: save(volume(shape=(*SHAPE, 2)), p, vector=True)),
+        ("absent.nii.gz", lambda p: None),
+    ],
+)
+def test_displacements_that_are_none(folder, capfd, name, make):
+    make(folder / name)
+    with pytest.raises(InputError, match=name) as error:
+        read_displacement(folder / name)
+    assert "\n" not in str(error.value)
+    assert capfd.readouterr() == ("", "")

@@ -6,14 +6,7 @@ import torch
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import invert
 from torchdeform.errors import InputError
-from torchdeform.nn import (
-    CurlLoss,
-    DeterminantLoss,
-    DiceLoss,
-    DivergenceLoss,
-    InverseConsistencyLoss,
-    SimilarityLoss,
-)
+from torchdeform.nn import CurlLoss, DeterminantLoss, DiceLoss, DivergenceLoss, InverseConsistencyLoss, SimilarityLoss
 from torchdeform.nn.losses import SIMILARITIES
 
 GRIDS = [Grid((9, 8), (1.0, 1.5)), Grid((7, 6, 8), (1.0, 2.0, 1.0))]

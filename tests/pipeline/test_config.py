@@ -5,7 +5,14 @@ from dataclasses import asdict
 import pytest
 
 from torchdeform.errors import InputError
-from torchdeform.pipeline.config import configs_folder, load_settings, parse_override, preset_names, read_yaml
+from torchdeform.pipeline.config import (
+    configs_folder,
+    load_settings,
+    parse_override,
+    preset_names,
+    read_yaml,
+    read_yaml_lines,
+)
 from torchdeform.registration.settings import RegistrationSettings
 
 
@@ -93,3 +100,14 @@ def test_unknown_names_get_the_nearest():
         load_settings(overrides={"window.size": 3})
     with pytest.raises(InputError, match="did you mean 'similarity'"):
         load_settings(overrides={"similarty": "ssd"})
+
+
+def test_lines_of_keys(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("a: &b\n  c: 1\nd:\n  - e\n  - <<: *b\n    f: 2\n", encoding="utf-8")
+    lines = read_yaml_lines(path)
+    assert lines[("a",)] == 1
+    assert lines[("a", "c")] == 2
+    assert lines[("d", 1)] == 5
+    assert lines[("d", 1, "f")] == 6
+    assert lines[("d", 1, "c")] == 2

@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-import typer
+from lopsided import lopsided
 
-from torchdeform.cli.check import check
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
-from torchdeform.errors import InputError, explain
-from torchdeform.io import read_image, write_image
+from torchdeform.errors import InputError
+from torchdeform.io import read_image
 from torchdeform.pipeline.preflight import (
     ERROR,
     NOTE,
@@ -22,21 +21,6 @@ from torchdeform.pipeline.preflight import (
     preflight,
 )
 from torchdeform.registration.settings import RegistrationSettings
-
-SHAPES = {2: (40, 52), 3: (22, 26, 30)}
-
-
-def lopsided(dim: int, **how) -> Image:
-    """An image that no turn takes to itself: three blobs of different weight."""
-    grid = Grid(SHAPES[dim], (2.0, 1.0, 1.5)[-dim:])
-    x = grid.points() / grid.along(grid.extent, grid.points())
-    centres = torch.tensor([[0.25, 0.3, 0.7], [0.6, 0.75, 0.65], [0.7, 0.3, 0.25]])[:, :dim]
-    data = torch.zeros(1, 1, *grid.shape)
-    for centre, weight in zip(centres, (1.0, 0.5, 0.8), strict=True):
-        distance = (x - centre.view(1, -1, *([1] * dim))).square().sum(1, keepdim=True)
-        data = data + weight * torch.exp(-distance / 0.03)
-    noise = torch.rand(data.shape, generator=torch.manual_seed(0))
-    return Image(100 * data + noise, grid, **({"name": "fixed.nii"} | how))
 
 
 def texts(report: Report, severity: str) -> str:
@@ -226,76 +210,6 @@ def test_orientation_codes(direction, letters, oblique):
     dim = len(direction)
     image = Image(torch.rand(1, 1, *[3] * dim), Grid((3,) * dim), direction=direction)
     assert (orientation(image), is_oblique(image)) == (letters, oblique)
-
-
-# --- the verb ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    """Run ``check`` in a folder with files; returns exit code, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-    fixed = lopsided(3)
-    write_image(fixed, "fixed.nii.gz")
-    write_image(replace(fixed, data=fixed.data.flip(2) + 1), "flipped.mha")
-    write_image(replace(fixed, origin=(1e4, 0.0, 0.0)), "far.nrrd")
-    write_image(lopsided(2), "plane.nii.gz")
-    write_image(replace(fixed, data=torch.zeros_like(fixed.data)), "nothing.nii.gz")
-
-    def run_check(*arguments: str) -> tuple[int, str, str]:
-        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-        app.command()(check)
-        try:
-            code = app(args=list(arguments), prog_name="check", standalone_mode=False) or 0
-        except InputError as error:
-            message, code = explain(error)
-            typer.echo(message, err=True)
-        return (code, *capsys.readouterr())
-
-    return run_check
-
-
-def test_the_verb_shows_both_images(run):
-    code, out, err = run("fixed.nii.gz", "fixed.nii.gz")
-    assert (code, err) == (0, "")
-    for line in ("fixed.nii.gz", "30 × 26 × 22", "1.5 × 1 × 2", "0, 0, 0", "LPS", "float32", "nothing looks wrong"):
-        assert line in out
-    assert len(out.splitlines()) == 9
-
-
-def test_the_verb_warns_and_draws(run, tmp_path):
-    code, out, _ = run("fixed.nii.gz", "flipped.mha", "--out", "new/overlay.png")
-    assert code == 0
-    assert "warning: flipped.mha looks mirrored along z" in out
-    assert "picture: new/overlay.png" in out
-    picture = read_image(tmp_path / "new" / "overlay.png")
-    assert min(picture.grid.shape) > 400
-    assert picture.data[0, :3].std() > 20
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "message"),
-    [
-        (["fixed.nii.gz", "far.nrrd"], 0, "warning: fixed.nii.gz and far.nrrd do not overlap"),
-        (["fixed.nii.gz", "far.nrrd", "--align", "none"], 2, "error: fixed.nii.gz and far.nrrd do not overlap"),
-        (["fixed.nii.gz", "plane.nii.gz", "--out", "a.png"], 2, "error: fixed.nii.gz is 3D but plane.nii.gz is 2D"),
-        (["fixed.nii.gz", "fixed.nii.gz", "--moving-mask", "nothing.nii.gz"], 2, "error: nothing.nii.gz is empty"),
-        (["fixed.nii.gz", "nothing.nii.gz"], 2, "error: nothing.nii.gz is constant"),
-        (["fixed.nii.gz", "absent.nii.gz"], 2, "absent.nii.gz does not exist"),
-        (["fixed.nii.gz", "far.nrrd", "--fixed-mask", "absent.nii.gz"], 2, "absent.nii.gz does not exist"),
-        (["fixed.nii.gz", "far.nrrd", "--out", "picture.jpg"], 2, "let its name end in .png"),
-        (["fixed.nii.gz", "far.nrrd", "--align", "afine"], 2, "did you mean 'affine'?"),
-    ],
-)
-def test_the_verb_says_what_is_wrong(run, tmp_path, arguments, code, message):
-    before = sorted(tmp_path.iterdir())
-    got, out, err = run(*arguments)
-    assert got == code
-    assert message in out + err
-    assert sorted(tmp_path.iterdir()) == before
-
-
-# --- real pairs -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.data

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 import SimpleITK as sitk
-import torch
 
 from torchdeform.cli.main import main
 from torchdeform.io.labels import read_labels
@@ -58,16 +57,3 @@ def test_what_is_written_is_what_was_measured(folder):
 def test_without_labels_nothing_is_said_of_them(folder):
     assert main(["fixed.nrrd", "moving.nrrd", "--preset", "fast", "--out", "out", "--quiet"]) == 0
     assert json.loads((folder / "out" / "result.json").read_text())["label_interpolation"] is None
-
-
-@pytest.mark.parametrize("channels", [3, 4])
-def test_a_grey_picture_in_colour_has_one_label_a_pixel(tmp_path, channels):
-    values = np.zeros((20, 24, channels), np.uint8)
-    values[5:9, 6:14, :3] = 255
-    values[..., 3:] = 255
-    sitk.WriteImage(sitk.GetImageFromArray(values, isVector=True), str(tmp_path / "labels.png"))
-    found = read_labels(tmp_path / "labels.png")
-    assert torch.equal(found.data[0, 0], torch.from_numpy(values[..., 0]).float())
-    values[6, 7, 0] = 200
-    sitk.WriteImage(sitk.GetImageFromArray(values, isVector=True), str(tmp_path / "colours.png"))
-    assert read_labels(tmp_path / "colours.png").data.shape[1] == channels

@@ -10,24 +10,17 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, resample
-from torchdeform.core.intensities import corresponding_channels, fill, to_common_scale
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import sample, warp
 from torchdeform.errors import InputError
 from torchdeform.registration.deformable import register
-from torchdeform.registration.landmarks import spread
 from torchdeform.registration.problem import Guidance, moved
 from torchdeform.registration.settings import RegistrationSettings
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
 QUICK = RegistrationSettings(steps=(30, 20, 10), weight_div=1.0, length=6.0, window=7, align="none")
-
-
-def landmarks(truth: Tensor, grid: Grid, count: int = 8) -> tuple[Tensor, Tensor]:
-    """Points well inside the grid, and where a displacement takes them."""
-    share = torch.rand(1, grid.dim, count, generator=torch.Generator().manual_seed(5))
-    points = (0.15 + 0.7 * share) * torch.tensor(grid.extent).view(1, -1, 1)
-    return points, points + sample(truth, points, grid)
 
 
 @pytest.mark.parametrize("similarity", ["lncc", "ssd", {"lncc": 1.0, "ncc": 1.0}])
@@ -74,92 +67,6 @@ def test_boolean_masks_and_masks_of_ones_mean_what_they_say():
     torch.testing.assert_close(plain.displacement, ones.displacement, rtol=0, atol=1e-3)
 
 
-def test_fill_keeps_what_is_known_and_stays_between_its_values():
-    for shape in ((33, 20), (9, 12, 17)):
-        image, mask = blobs(shape, 3, items=2), (torch.rand(2, 1, *shape) < 0.1).float()
-        filled = fill(torch.where(mask > 0, image, torch.nan), mask)
-        assert torch.equal(filled[mask > 0], image[mask > 0])
-        for item in range(2):
-            known = image[item][mask[item] > 0]
-            assert filled[item].min() >= known.min() - 1e-5
-            assert filled[item].max() <= known.max() + 1e-5
-
-
-def test_intensities_are_scaled_by_what_the_masks_show_channel_by_channel():
-    image = torch.cat([blobs((32, 32), 1), 100 * blobs((32, 32), 2), torch.zeros(1, 1, 32, 32)], dim=1)
-    mask = disc((32, 32), (16, 16), 8)
-    spoilt = torch.where(mask > 0, image, 1e6)
-    scaled, other = to_common_scale((spoilt, image), (mask, None), jointly=False)
-    for channel in (0, 1):
-        inside = scaled[0, channel][mask[0, 0] > 0]
-        assert inside.quantile(0.005).item() == pytest.approx(0, abs=0.01)
-        assert inside.quantile(0.995).item() == pytest.approx(1, abs=0.01)
-    assert (other[:, 2] == 0).all()
-    jointly = to_common_scale((image, 2 * image), (None, None), jointly=True)
-    ranges = [float(scaled[0, 0].max() - scaled[0, 0].min()) for scaled in jointly]
-    assert ranges[1] == pytest.approx(2 * ranges[0], rel=1e-4)
-
-
-@pytest.mark.parametrize("shape", [(64, 80), (28, 32, 36)])
-@pytest.mark.parametrize("symmetric", [False, True])
-def test_landmarks_with_a_high_weight_meet_although_the_images_say_otherwise(shape, symmetric):
-    grid, moving = Grid(shape), blobs(shape, 1)
-    truth = bend(grid, 3.0)
-    points, ends = landmarks(truth, grid)
-    guidance = Guidance(fixed_points=points, moving_points=ends + 1.5)
-    settings = RegistrationSettings(points_weight=30.0, symmetric=symmetric)
-    result = register(warp(moving, truth, grid), moving, settings, guidance=guidance)
-    assert result.evaluation is not None
-    assert result.evaluation.before.distances.mean() > 1.5
-    assert result.evaluation.after.distances.max() < 0.2
-    assert result.diagnosis.folds.item() == 0
-
-
-def test_landmarks_and_images_are_combined():
-    shape = (64, 80)
-    grid, moving = Grid(shape), blobs(shape, 1)
-    truth = bend(grid, 3.0)
-    points, ends = landmarks(truth, grid)
-    fixed = warp(moving, truth, grid)
-    climb = replace(QUICK, tolerance=0.0)  # all steps, so that the ends can be compared
-    after, similar = [], []
-    for weight in (0.0, 0.001, 1.0):
-        guidance = Guidance(fixed_points=points, moving_points=ends + 1.5)
-        result = register(fixed, moving, replace(climb, points_weight=weight), guidance=guidance)
-        after.append(result.evaluation.after.distances.mean().item())
-        similar.append(result.similarity_after.item())
-    assert after[0] > after[1] > after[2]
-    assert similar[0] > similar[1] > similar[2]
-    plain = register(fixed, moving, climb)  # weight 0 only measures
-    assert similar[0] == plain.similarity_after.item()
-
-
-@pytest.mark.parametrize("shape", [(48, 56), (24, 28, 26)])
-@pytest.mark.parametrize("symmetric", [False, True])
-def test_landmarks_that_contradict_each_other_do_not_make_it_fold(shape, symmetric):
-    grid, moving = Grid(shape), blobs(shape, 1)
-    points, _ = landmarks(torch.zeros(1, grid.dim, *shape), grid)
-    guidance = Guidance(fixed_points=points, moving_points=points.flip(2))
-    settings = replace(QUICK, points_weight=100.0, symmetric=symmetric)
-    result = register(moving.flip(2), moving, settings, guidance=guidance)
-    assert result.diagnosis.folds.item() == 0
-    nearer = result.evaluation.after.distances.mean() < result.evaluation.before.distances.mean()
-    assert nearer or symmetric  # two maps bring the ends of a pair together in the middle, which says less
-
-
-@pytest.mark.parametrize("shape", [(6, 7), (4, 5, 6)])
-def test_spreading_is_the_transpose_of_interpolation(shape):
-    grid = Grid(shape, tuple(0.5 + 0.3 * k for k in range(len(shape))))
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(2, grid.dim, 9, generator=generator) * 1.2 - 0.1  # some outside
-    points = (points * torch.tensor(grid.extent).view(1, -1, 1)).double()
-    field = torch.randn(2, 3, *shape, generator=generator).double()
-    values = torch.randn(2, 3, 9, generator=generator).double()
-    at_points = (sample(field, points, grid) * values).flatten(1).sum(1)
-    at_nodes = (field * spread(values, points, grid)).flatten(1).sum(1)
-    torch.testing.assert_close(at_points, at_nodes)
-
-
 def test_every_channel_counts():
     """The halves of the truth that one channel cannot see, the other does."""
     shape = (64, 64)
@@ -173,26 +80,6 @@ def test_every_channel_counts():
         u = register(fixed[:, channels], both[:, channels], QUICK).displacement
         errors.append((u - truth).square().sum(1).sqrt()[inside].mean().item())
     assert errors[2] < 0.6 * min(errors[:2])
-
-
-def test_channels_that_correspond():
-    grid = Grid((8, 9))
-    grey, colour = (Image(torch.rand(1, c, 8, 9), grid, name=n) for c, n in ((1, "a"), (3, "b")))
-    shades = replace(colour, data=grey.data.expand(1, 3, 8, 9))
-    many = Image(torch.rand(1, 5, 8, 9), grid, name="many")
-    clear = replace(colour, data=torch.cat([colour.data, torch.zeros(1, 1, 8, 9)], dim=1))
-
-    def counts(*images: Image) -> list[int]:
-        return [image.data.shape[1] for image in corresponding_channels(*images)]
-
-    assert counts(grey, grey) == [1, 1]
-    assert counts(colour, colour) == counts(clear, colour) == [3, 3]
-    assert counts(grey, colour) == counts(clear, grey) == [1, 1]
-    assert counts(shades, shades) == counts(shades, grey) == [1, 1]
-    assert counts(many, many) == [5, 5]
-    assert (corresponding_channels(clear, clear)[0].data == 0).all()
-    with pytest.raises(InputError, match="many has 5 channels and b 3"):
-        corresponding_channels(many, colour)
 
 
 @pytest.mark.parametrize("symmetric", [False, True])
@@ -309,6 +196,8 @@ def image(data: Tensor, name: str = "image") -> Image:
 
 
 PAIR = torch.rand(1, 1, 16, 16), torch.rand(1, 1, 16, 16)
+
+
 POINTS = torch.rand(1, 2, 3)
 
 
@@ -362,10 +251,3 @@ def test_starts_and_affine_maps_that_do_not_fit_are_named():
             register(*PAIR, QUICK, start=start)
     with pytest.raises(InputError, match="must be Images"):
         register(*PAIR, QUICK, affine=Affine.identity(2))
-
-
-@pytest.mark.parametrize("shape", [(3, 40), (9, 2, 33)])
-def test_fill_reaches_across_axes_of_very_different_length(shape):
-    image, mask = torch.full((1, 1, *shape), math.nan), torch.zeros(1, 1, *shape)
-    image[..., 0], mask[..., 0] = 5.0, 1.0
-    torch.testing.assert_close(fill(image, mask), torch.full_like(image, 5.0))

@@ -7,16 +7,13 @@ from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
-import torch
 
-from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image
 from torchdeform.report import make_report_data, write_report
-from torchdeform.report.pictures import fitting_pictures
-from torchdeform.report.record import describe, write_json
-from torchdeform.report.web_images import frame_of, image_strip
+from torchdeform.report.record import write_json
 
 FRAMES = {2: 4, 3: 10}
+
+
 VOID = {"meta", "link", "br", "img", "input", "hr", "path", "use", "rect"}
 
 
@@ -142,54 +139,3 @@ def test_long_tables_are_folded(tmp_path, make_full):
     _, page = _page(tmp_path, *make_full(2, labels=30, landmarks=40))
     assert "All 30 labels" in page.text
     assert "All 40 landmarks" in page.text
-
-
-@pytest.mark.parametrize(("shape", "channels"), [((1600, 1500), 3), ((160, 192, 224), 1)])
-def test_a_large_noisy_image_makes_a_small_page(tmp_path, make_image, make_result, shape, channels):
-    """Noise is what JPEG likes least, in the images and in the map."""
-    small, grid = make_image((8,) * len(shape)), Grid(shape)
-    random = torch.Generator().manual_seed(0)
-    noise, u = (torch.rand(1, count, *shape, generator=random) for count in (channels, grid.dim))
-    fixed = Image(noise, grid, pixel_type="uint8")
-    result = replace(make_result(small, small), displacement=u, inverse=-u, warped=noise.flip(2), grid=grid)
-    write_report(tmp_path / "report.html", make_report_data(fixed, fixed, result), describe(result, fixed, fixed))
-    assert (tmp_path / "report.html").stat().st_size < 5e6
-
-
-def test_a_sprite_holds_the_slices_upright(make_image, make_result):
-    """A bright corner of the second slice is where it belongs, below the first, turned like the plane."""
-    import base64
-    import io
-
-    import numpy as np
-    from PIL import Image as Picture
-
-    report_data = make_report_data(
-        *[make_image((20, 24, 28))] * 2, make_result(*[make_image((20, 24, 28))] * 2), slices=3
-    )
-    cuts = report_data.slices[1]
-    assert cuts.plane.turned == (True, False)
-    frame = frame_of(cuts.plane, 3, 200)
-    pixels = np.zeros((3, *cuts.plane.shape, 1), dtype=np.uint8)
-    pixels[1, -6:, :6] = 255
-    data = base64.b64decode(image_strip(pixels, cuts.plane, frame, 90).partition(",")[2])
-    sheet = np.asarray(Picture.open(io.BytesIO(data)))
-    assert sheet.shape == (3 * frame.pitch, frame.across)
-    down, across = (values.mean() for values in np.nonzero(sheet > 128))
-    assert frame.pitch < down < frame.pitch + frame.down / 3
-    assert across < frame.across / 3
-    positions = frame.positions
-    assert positions[0] < positions[1] < positions[2]
-    top = positions[1] / 100 * (3 * frame.pitch - frame.down)
-    assert top == pytest.approx(frame.pitch + 4, abs=0.01)
-
-
-def test_pictures_are_made_smaller_where_they_would_not_fit(make_image, make_result, monkeypatch):
-    fixed = make_image((200, 300), channels=3, pixel_type="uint8")
-    report_data = make_report_data(fixed, fixed, make_result(fixed, fixed))
-    sizes = []
-    for most in (10**9, 10**5, 0):
-        monkeypatch.setattr("torchdeform.report.pictures._MOST", most)
-        found = fitting_pictures(report_data)
-        sizes.append(sum(picture.size for group in found["groups"].values() for picture in group))  # type: ignore
-    assert sizes[0] > sizes[1] >= sizes[2] > 0

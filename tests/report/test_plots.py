@@ -130,8 +130,3 @@ def test_an_item_that_is_not_there_is_refused(make_image, make_result):
     fixed = make_image((12, 14))
     with pytest.raises(InputError, match="there is no item 1"):
         report.plot_convergence(make_result(fixed, fixed), item=1)
-
-
-def test_colours_of_curves_differ_in_brightness_or_blue():
-    """Okabe and Ito's palette, no colour twice."""
-    assert len(set(drawing.CURVES)) == len(drawing.CURVES)

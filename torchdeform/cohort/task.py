@@ -14,11 +14,11 @@ from typing import Any
 
 from torchdeform.cohort.plan import Job, register_job
 from torchdeform.errors import InputError, explain
+from torchdeform.pipeline.memory import peak
 from torchdeform.pipeline.register import Outcome
 
 DONE, FAILED = "done", "failed"
 
-_PEAK = "VmHWM:"
 # Figures of a pair's record that go into the summary as they are.
 _FIGURES = (
     "similarity_before",
@@ -150,17 +150,7 @@ def _forget_peak() -> None:
 def _peaks() -> tuple[int, int]:
     """Return the peaks of this process's memory and of its GPU's, in bytes."""
     cuda = _cuda()
-    return _peak(), 0 if cuda is None else cuda.max_memory_allocated()
-
-
-def _peak() -> int:
-    with suppress(OSError):
-        for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
-            if line.startswith(_PEAK):
-                return int(line.split()[1]) * 1024
-    import resource  # not on every system
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return peak() or 0, 0 if cuda is None else cuda.max_memory_allocated()
 
 
 def _cuda() -> Any:

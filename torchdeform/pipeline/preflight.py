@@ -15,8 +15,8 @@ from torchdeform.core.intensities import corresponding_channels
 from torchdeform.core.resampling import MIN_NODES
 from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
-from torchdeform.metrics.similarity import similarity_weights
-from torchdeform.pipeline.memory import available, estimate, readable
+from torchdeform.metrics.similarity import needs_common_scale
+from torchdeform.pipeline.memory import available, footprint, readable
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.report_data import quantiles
 
@@ -74,6 +74,7 @@ def preflight(
     moving_mask: Image | None = None,
     aligned: bool = False,
     settings: RegistrationSettings | None = None,
+    memory: int | None = None,
 ) -> Report:
     """Return what looks wrong with a pair of images before it is registered.
 
@@ -84,6 +85,7 @@ def preflight(
         moving_mask: the same for the moving image.
         aligned: whether the images are aligned before the deformation. Images that do not overlap are then no error.
         settings: how they will be registered; the defaults when None.
+        memory: bytes that a coarser grid keeps the registration to; None for all that is free.
 
     Returns:
         `Report`. Errors are not raised; `Report.require_ok` does that.
@@ -113,7 +115,7 @@ def preflight(
             *_check_scale(fixed, moving, settings),
             *_check_channels(fixed, moving),
             *_check_orientation(fixed, moving),
-            *_check_memory(fixed, settings),
+            *([] if memory else _check_memory(fixed, settings)),
         ]
     for image, mask in ((fixed, fixed_mask), (moving, moving_mask)):
         found += [] if mask is None else _check_mask(image, mask)
@@ -217,7 +219,7 @@ def _check_scale(fixed: Image, moving: Image, settings: RegistrationSettings) ->
     ranges = [_range(image) for image in (fixed, moving)]
     if max(ranges) / max(min(ranges), 1e-30) > _SCALE_RATIO:
         text = f"{fixed.name} spans {ranges[0]:.4g} grey values and {moving.name} {ranges[1]:.4g}"
-        if "ssd" in similarity_weights(settings.similarity):
+        if needs_common_scale(settings.similarity):
             yield Finding(WARNING, f"{text}; scale them alike, or use another similarity than ssd")
         else:
             yield Finding(NOTE, f"{text}; scale them alike if they are of one kind and you compare them by ssd")
@@ -262,8 +264,7 @@ def _check_orientation(fixed: Image, moving: Image) -> Iterator[Finding]:
 
 def _check_memory(fixed: Image, settings: RegistrationSettings) -> Iterator[Finding]:
     room = available(fixed.data.device)
-    how = {"channels": fixed.data.shape[1], "similarity": settings.similarity, "start": settings.start}
-    need = estimate(fixed.grid, **how)
+    need = footprint(fixed.grid, fixed.data.shape[1], settings)
     if room is None or need < 0.8 * room:
         return
     text = (

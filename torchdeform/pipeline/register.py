@@ -18,7 +18,7 @@ from torchdeform.io.images import ending_like
 from torchdeform.io.labels import read_labels, write_labels
 from torchdeform.io.points import matched, read_points
 from torchdeform.metrics.evaluation import common_labels
-from torchdeform.pipeline.memory import available, estimate, fitting_grid, peak, readable
+from torchdeform.pipeline.memory import available, fitting_grid, footprint, peak, readable
 from torchdeform.pipeline.preflight import WARNING, preflight
 from torchdeform.registration.deformable import onto_grid
 from torchdeform.registration.problem import Guidance
@@ -113,7 +113,7 @@ def choose_device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-def read_inputs(files: PairFiles, settings: RegistrationSettings) -> Inputs:
+def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | None = None) -> Inputs:
     """Read all files of a pair and check that they can be registered at all.
 
     Raises:
@@ -129,6 +129,7 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings) -> Inputs:
         moving_mask=masks[1],
         aligned=settings.align != "none",
         settings=settings,
+        memory=memory,
     )
     report.require_ok()
     corresponding_channels(fixed, moving)
@@ -193,7 +194,7 @@ def register_files(
 
     where, start = choose_device(device), perf_counter()
     require_writable(files.out)
-    inputs = read_inputs(files, settings)
+    inputs = read_inputs(files, settings, memory)
     work, notes = _fitted(inputs.fixed, settings, memory, where)
     run = _Run(memory, {"read": perf_counter() - start}, {"read": peak()})
     result = register(
@@ -219,9 +220,8 @@ def _fitted(
     fixed: Image, settings: RegistrationSettings, memory: int | None, device: torch.device
 ) -> tuple[Image, tuple[str, ...]]:
     """Return the fixed image on the finest grid that memory allows, and a sentence if that is a coarser one."""
-    how = {"channels": fixed.data.shape[1], "similarity": settings.similarity, "start": settings.start}
-    maps = 2 if settings.symmetric else 1
-    need, free = maps * estimate(fixed.grid, **how), available(device)
+    channels = fixed.data.shape[1]
+    need, free = footprint(fixed.grid, channels, settings), available(device)
     if memory is None:
         if free is not None and need > free:
             raise InputError(
@@ -229,7 +229,7 @@ def _fitted(
                 f"use --memory {readable(free, spaced=False)} to register it on a coarser grid"
             )
         return fixed, ()
-    grid = fitting_grid(fixed.grid, memory // maps, **how)
+    grid = fitting_grid(fixed.grid, memory, channels, settings)
     if grid == fixed.grid:
         return fixed, ()
     sizes = " instead of ".join("×".join(map(str, g.shape[::-1])) for g in (grid, fixed.grid))

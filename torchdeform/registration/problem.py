@@ -12,7 +12,7 @@ from torchdeform.core.intensities import corresponding_channels, fill, to_common
 from torchdeform.core.resampling import restrict
 from torchdeform.core.transform import Affine
 from torchdeform.errors import InputError
-from torchdeform.metrics.similarity import on_one_scale
+from torchdeform.metrics.similarity import needs_common_scale
 from torchdeform.registration.settings import RegistrationSettings
 
 
@@ -128,7 +128,7 @@ class Scene:
         images = to_common_scale(
             (self.fixed, self.moving),
             (self.fixed_mask, self.moving_mask),
-            jointly=on_one_scale(settings.similarity),
+            jointly=needs_common_scale(settings.similarity),
         )
         return replace(self, fixed=images[0], moving=images[1])
 

@@ -1,91 +1,18 @@
 """Alignment: known maps are found again, in any frame; its derivative against differences; what it refuses."""
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
+from affine_pairs import distance, empty, make_pair, make_true, picture, scene, turn
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine
 from torchdeform.errors import InputError
-from torchdeform.metrics.correlation import DetailCorrelation
-from torchdeform.metrics.similarity import make_similarity
 from torchdeform.registration.affine.align import AlignmentSettings, affine_warp, align
-from torchdeform.registration.affine.bfgs import climb
-from torchdeform.registration.affine.lie import angle, exponential, generators, homogeneous, rotations
-from torchdeform.registration.affine.objective import Frame, Level, Masked
-from torchdeform.registration.affine.search import body, make_starts
 from torchdeform.registration.settings import ALIGNMENTS
-
-TILTED = {
-    2: ((math.cos(0.4), -math.sin(0.4)), (math.sin(0.4), math.cos(0.4))),
-    3: ((0.936293363584, -0.275095847318, 0.218350663146),
-        (0.289629477625, 0.956425085849, -0.036957013525),
-        (-0.198669330795, 0.097843395007, 0.975170327202)),
-}  # fmt: skip
-SHAPES = {2: ((60, 76), (84, 68)), 3: ((32, 40, 48), (40, 44, 50))}
-SPACINGS = {2: ((1.4, 1.2), (1.2, 1.3)), 3: ((2.0, 1.6, 1.4), (1.6, 1.7, 1.5))}
-SIDES = (60.0, 44.0, 36.0)
-
-
-def scene(world: Tensor, count: int = 14) -> Tensor:
-    """A value for every world point: blobs of different width and height near the origin, no two places alike."""
-    random = torch.Generator().manual_seed(0)
-    dim = world.shape[1]
-    centres = (torch.rand(count, dim, generator=random, dtype=torch.float64) - 0.5) * torch.tensor(SIDES[:dim])
-    widths = 5 + 5 * torch.rand(count, generator=random, dtype=torch.float64)
-    heights = 50 + 150 * torch.rand(count, generator=random, dtype=torch.float64)
-    total = torch.zeros_like(world[:, :1])
-    for centre, width, height in zip(centres, widths, heights, strict=True):
-        away = (world - centre.view(1, -1, *([1] * (world.dim() - 2)))).square().sum(1, keepdim=True)
-        total += height * torch.exp(-away / (2 * width**2))
-    return total
-
-
-def empty(shape, spacing, *, centre=None, tilted=False) -> Image:
-    """An image whose box has its middle at ``centre``."""
-    grid = Grid(shape, spacing)
-    image = Image(torch.zeros(1, 1, *shape), grid, (), TILTED[len(shape)] if tilted else ())
-    middle = image.to_world(torch.tensor(grid.extent, dtype=torch.float64).view(1, -1, 1) / 2).flatten()
-    target = torch.zeros(len(shape)) if centre is None else torch.as_tensor(centre)
-    return replace(image, origin=tuple((target - middle).tolist()))
-
-
-def picture(place: Image, through: Affine | None = None) -> Image:
-    """The scene on the grid of ``place``, each world point being taken through a map first."""
-    world = place.to_world(place.grid.points(dtype=torch.float64))
-    return replace(place, data=scene(world if through is None else through(world)).float())
-
-
-def make_pair(true: Affine, *, follow: bool = False, finer: float = 1.0) -> tuple[Image, Image]:
-    """Two images with moving(true(x)) = fixed(x), on grids that have nothing in common."""
-    dim = len(true.offset)
-    (first, second), (wide, other) = SHAPES[dim], SPACINGS[dim]
-    fixed = picture(empty(first, wide, tilted=True))
-    other = tuple(h * finer for h in other)
-    return fixed, picture(empty(second, other, centre=true.offset if follow else None), true.inverse())
-
-
-def turn(dim: int, degrees: float) -> Tensor:
-    axis = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64) / math.sqrt(14)
-    a, b, c = (math.radians(degrees) * axis).tolist()
-    spin = {2: [[0.0, -math.radians(degrees)], [math.radians(degrees), 0.0]], 3: [[0, -c, b], [c, 0, -a], [-b, a, 0]]}
-    return torch.matrix_exp(torch.tensor(spin[dim], dtype=torch.float64))
-
-
-def make_true(linear: Tensor, *shift: float) -> Affine:
-    offset = torch.tensor((shift or (3.0, -4.0, 2.0))[: len(linear)], dtype=torch.float64)
-    return Affine(linear, offset)
-
-
-def distance(found: Affine, true: Affine, fixed: Image) -> float:
-    """Mean distance of both maps over the fixed grid, in its smallest voxels."""
-    world = fixed.to_world(fixed.grid.points(dtype=torch.float64))
-    return float((found(world) - true(world)).norm(dim=1).mean()) / min(fixed.grid.spacing)
-
 
 SHEARED = {dim: torch.eye(dim, dtype=torch.float64).index_put((torch.tensor([0]), torch.tensor([1])), torch.tensor(0.3,
            dtype=torch.float64)) for dim in (2, 3)}  # fmt: skip
@@ -207,16 +134,6 @@ def test_each_kind_stays_what_it_is(dim, kind):
         assert found.similarity_before == found.similarity_after
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_a_mirror_image_is_told_and_not_taken(dim):
-    mirror = torch.eye(dim, dtype=torch.float64)
-    mirror[0, 0] = -1
-    fixed, moving = make_pair(make_true(turn(dim, 20) @ mirror))
-    found = align(fixed, moving)
-    assert torch.linalg.det(found.affine.matrix) > 0
-    assert any("mirror image" in sentence for sentence in found.warnings)
-
-
 def test_a_mask_keeps_what_moves_differently_out_of_it():
     """A bright bar lies elsewhere in each image; masks on both sides leave it out."""
     true = make_true(turn(2, 15))
@@ -258,73 +175,6 @@ def test_colour_is_aligned_on_its_luminance():
     )
 
 
-def make_level(dim: int, similarity: str = "ncc") -> Level:
-    fixed, moving = make_pair(make_true(turn(dim, 10)))
-    weight = torch.rand(fixed.data.shape, generator=torch.Generator().manual_seed(1))
-    parts = (
-        Masked(replace(fixed, data=fixed.data.double() / 200), weight.double()),
-        Masked(replace(moving, data=moving.data.double() / 200)),
-    )
-    make = {"detail": lambda f, grid: DetailCorrelation(f, 5)}.get(
-        similarity, lambda f, grid: make_similarity(similarity, f, 5, grid=grid)
-    )
-    return Level(*parts, Frame.of(fixed), make, 0.1)
-
-
-@pytest.mark.parametrize("similarity", ["ncc", "ssd", "lncc", "detail"])
-@pytest.mark.parametrize("dim", [2, 3])
-def test_slope_is_that_of_differences(dim, similarity):
-    """Up to the interpolated derivative of the moving image, and weights at its edge that count as constant."""
-    level, moves = make_level(dim, similarity), generators("affine", dim)
-    start = exponential(torch.full((1, len(moves)), 0.03, dtype=torch.float64), moves)
-    slope = torch.einsum("bij,pij->p", level.evaluate(start)[1], moves)
-    steps = 1e-3 * torch.eye(len(moves), dtype=torch.float64)
-    values = [level.values(start @ exponential(sign * steps, moves))[0] for sign in (1, -1)]
-    expected = (values[0] - values[1]) / 2e-3
-    assert (slope - expected).norm() < 0.15 * expected.norm()
-
-
-def test_several_maps_climb_as_each_alone():
-    level, moves = make_level(2), generators("affine", 2)
-    starts = exponential(0.1 * torch.randn(3, 6, generator=torch.Generator().manual_seed(2)).double(), moves)
-    maps, values = climb(level, starts, moves, steps=8)
-    for k in range(3):
-        alone, value = climb(level, starts[k : k + 1], moves, steps=8)
-        torch.testing.assert_close(maps[k], alone[0], atol=1e-8, rtol=0)
-        torch.testing.assert_close(values[k], value[0])
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_rotations_are_a_group_that_leaves_no_gaps(dim):
-    every = rotations(dim)
-    eye = torch.eye(dim, dtype=torch.float64)
-    assert len(every) == {2: 36, 3: 60}[dim]
-    torch.testing.assert_close(every[0], eye)
-    torch.testing.assert_close(every @ every.transpose(1, 2), eye.expand_as(every))
-    assert (torch.linalg.det(every) > 0).all()
-    products = (every[:, None] @ every).flatten(0, 1)
-    nearest = (products[:, None] - every).flatten(2).norm(dim=2).amin(1)
-    assert nearest.max() < 1e-12
-    others = torch.linalg.qr(torch.randn(500, dim, dim, generator=torch.Generator().manual_seed(0)).double()).Q
-    others[:, :, 0] *= torch.linalg.det(others).view(-1, 1)
-    gaps = angle(others[:, None] @ every.transpose(1, 2)).amin(1)
-    assert gaps.max() < {2: 5.01, 3: 44.5}[dim]
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_principal_axes_give_the_rotation_of_an_elongated_body(dim):
-    parts = []
-    for place, back in zip(make_pair(make_true(turn(dim, 50))), (turn(dim, 0), turn(dim, -50)), strict=True):
-        own = make_true(back, 0.0, 0.0, 0.0)(place.to_world(place.grid.points(dtype=torch.float64)))
-        lengths = place.grid.along((10.0, 6.0, 3.0)[:dim], own)
-        parts.append(Masked(place, torch.exp(-(own / lengths).square().sum(1, keepdim=True))))
-    frame = Frame.of(parts[0].image)
-    starts = make_starts(body(parts[0], frame), body(parts[1], frame), turn=True, scale=False)
-    axes = [s.map[:dim, :dim] for s in starts if s.name.startswith("moments")]
-    assert len(axes) == 2 ** (dim - 1)
-    assert min(float(angle(a @ turn(dim, -50))) for a in axes) < 5
-
-
 @pytest.mark.parametrize("dim", [2, 3])
 def test_affine_warp_differentiates_in_the_map_and_the_image(dim):
     shape = (5, 6, 7)[:dim]
@@ -347,12 +197,6 @@ def test_affine_warp_gives_the_scene_back():
     assert difference.abs().max() < 3.0
 
 
-def test_exponential_is_the_flow_of_a_move():
-    spin = generators("rigid", 2)[2:]
-    map_ = exponential(torch.tensor([[0.3]], dtype=torch.float64), spin)[0]
-    torch.testing.assert_close(map_, homogeneous(turn(2, math.degrees(0.3)), torch.zeros(2, dtype=torch.float64)))
-
-
 @pytest.mark.parametrize("dim", [2, 3])
 def test_settings_left_open_go_by_the_number_of_axes(dim):
     window, nodes = {2: (7, 20_000), 3: (5, 150_000)}[dim]
@@ -365,6 +209,8 @@ def test_settings_left_open_go_by_the_number_of_axes(dim):
 
 
 FIXED, MOVING = make_pair(make_true(turn(2, 5)))
+
+
 SOLID = picture(empty((16, 16, 16), (4.0, 4.0, 4.0)))
 
 

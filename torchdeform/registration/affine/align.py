@@ -15,7 +15,7 @@ from torchdeform.core.transform import Affine
 from torchdeform.core.warp import sample
 from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.metrics.correlation import DetailCorrelation
-from torchdeform.metrics.similarity import Similarity, features, make_similarity, on_one_scale, similarity_weights
+from torchdeform.metrics.similarity import Similarity, features, make_similarity, needs_common_scale, similarity_weights
 from torchdeform.registration.affine.lie import generators
 from torchdeform.registration.affine.objective import Frame, Level, Masked
 from torchdeform.registration.affine.search import Candidate, Found, climbed, search
@@ -258,7 +258,7 @@ def _prepared(
         raise InputError(f"{kinds}; give two images of the same dimension")
     pair = [_weighted(luminance(image), mask).cropped(_MARGIN) for image, mask in (fixed, moving)]
     ranges = [_range(part) for part in pair]
-    if on_one_scale(settings.similarity):
+    if needs_common_scale(settings.similarity):
         ranges = [(min(r[0] for r in ranges), max(r[1] for r in ranges))] * len(pair)
     first, second = (_scaled(part, *r) for part, r in zip(pair, ranges, strict=True))
     return first, second

@@ -1,0 +1,62 @@
+"""Patterns of file names: which files are found, with which parts, and what text means itself."""
+
+import pytest
+from cohort_files import BIDS
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchdeform.cohort.patterns import fill, find, literal, only, part_names
+from torchdeform.errors import InputError
+
+
+def test_parts_are_found_and_sorted_by_their_numbers(touch):
+    folder = touch([*BIDS, "sub-01/ses-1/anat/sub-01_T2w.nii.gz", "sub-03/anat/x_T1w.nii.gz"])
+    found = find(f"{folder}/sub-{{subject}}/ses-{{session}}/anat/*_T1w.nii.gz", {})
+    assert [one.parts["subject"] + "/" + one.parts["session"] for one in found] == [
+        "01/1", "01/2", "01/10", "02/1", "02/2", "02/10",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("pattern", "names"),
+    [
+        ("*.png", ["a1.png", "a2.png", "b1.png"]),
+        ("?1.png", ["a1.png", "b1.png"]),
+        ("[!a]?.png", ["b1.png"]),
+        ("[ab]2.png", ["a2.png"]),
+        ("**/*.tif", ["c.tif", "d.tif"]),
+        ("{x}/{x}.jpg", ["e.jpg"]),
+        ("{x}.pn", []),
+        (".*", [".hidden.png"]),
+    ],
+)
+def test_patterns_are_those_of_a_shell(touch, pattern, names):
+    folder = touch(["a1.png", "a2.png", "b1.png", "c.tif", "deep/er/d.tif", "e/e.jpg", "e/f.jpg", ".hidden.png"])
+    assert [one.path.name for one in find(f"{folder}/{pattern}", {})] == names
+
+
+def test_a_part_may_be_limited(touch):
+    folder = touch(["s1.png", "s1_label.png", "sx.png"])
+    assert [one.parts for one in find(f"{folder}/s{{n}}.png", {"n": "[0-9]+"})] == [{"n": "1"}]
+    with pytest.raises(InputError, match="makes no regular expression"):
+        find(f"{folder}/s{{n}}.png", {"n": "(?P<n>x)"})
+
+
+@given(st.text(alphabet="ab*?[]{}!-.", min_size=1, max_size=8))
+def test_literal_means_the_text_itself(text):
+    assert only(f"/{literal(text)}").as_posix() == f"/{text}" or text.strip(".") == ""
+    assert part_names(literal(text)) == ()
+
+
+@given(st.text(alphabet="ab*?[{}", min_size=1, max_size=6))
+def test_what_is_filled_in_is_taken_literally(text):
+    assert only(fill("/x{part}.png", {"part": text})).as_posix() == f"/x{text}.png"
+
+
+def test_one_file_must_match(touch):
+    folder = touch(["a1.png", "a2.png"])
+    assert only(f"{folder}/a1*").name == "a1.png"
+    with pytest.raises(InputError, match="must match one file, and 2 files match"):
+        only(f"{folder}/a*")
+    with pytest.raises(InputError, match="must match one file, and no file matches"):
+        only(f"{folder}/b*")

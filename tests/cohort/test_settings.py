@@ -1,0 +1,30 @@
+"""Settings of a cohort: contradictions are refused, variables are filled in."""
+
+import pytest
+from pydantic import ValidationError
+
+from torchdeform.cohort.settings import EngineSettings, expand
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"kind": "dask"}, "either scheduler"),
+        ({"kind": "dask", "scheduler": "tcp://a:1", "cluster": {"kind": "local"}}, "either scheduler"),
+        ({"scheduler": "tcp://a:1"}, "scheduler stands with kind: dask"),
+        ({"cluster": {"kind": "local"}}, "cluster stands with kind: dask"),
+        ({"kind": "dask", "scheduler": "tcp://a:1", "workers": 2}, "workers stands with kind: local"),
+        ({"kind": "dask", "cluster": {"kind": "slurm", "workers": 4, "cores": 2}}, "need as many cores"),
+        ({"kind": "dask", "cluster": {"kind": "slurm", "workers": 4, "cores": 8, "gpus": 2}}, "takes a GPU"),
+        ({"workers": 0}, "greater than or equal to 1"),
+        ({"timeout": 0}, "greater than 0"),
+    ],
+)
+def test_settings_that_contradict_are_refused(settings, sentence):
+    with pytest.raises(ValidationError, match=sentence):
+        EngineSettings(**settings)
+
+
+def test_expanding_leaves_other_text_alone(monkeypatch):
+    monkeypatch.setenv("A", "b")
+    assert expand("x/$A/${A}_{part}*[c]") == "x/b/b_{part}*[c]"

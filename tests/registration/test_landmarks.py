@@ -1,0 +1,84 @@
+"""Landmarks: they meet, they count beside the images, and contradictions do not make a map fold."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from pictures import bend, blobs
+from torch import Tensor
+
+from torchdeform.core.grid import Grid
+from torchdeform.core.warp import sample, warp
+from torchdeform.registration.deformable import register
+from torchdeform.registration.landmarks import spread
+from torchdeform.registration.problem import Guidance
+from torchdeform.registration.settings import RegistrationSettings
+
+QUICK = RegistrationSettings(steps=(30, 20, 10), weight_div=1.0, length=6.0, window=7, align="none")
+
+
+def landmarks(truth: Tensor, grid: Grid, count: int = 8) -> tuple[Tensor, Tensor]:
+    """Points well inside the grid, and where a displacement takes them."""
+    share = torch.rand(1, grid.dim, count, generator=torch.Generator().manual_seed(5))
+    points = (0.15 + 0.7 * share) * torch.tensor(grid.extent).view(1, -1, 1)
+    return points, points + sample(truth, points, grid)
+
+
+@pytest.mark.parametrize("shape", [(64, 80), (28, 32, 36)])
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_landmarks_with_a_high_weight_meet_although_the_images_say_otherwise(shape, symmetric):
+    grid, moving = Grid(shape), blobs(shape, 1)
+    truth = bend(grid, 3.0)
+    points, ends = landmarks(truth, grid)
+    guidance = Guidance(fixed_points=points, moving_points=ends + 1.5)
+    settings = RegistrationSettings(points_weight=30.0, symmetric=symmetric)
+    result = register(warp(moving, truth, grid), moving, settings, guidance=guidance)
+    assert result.evaluation is not None
+    assert result.evaluation.before.distances.mean() > 1.5
+    assert result.evaluation.after.distances.max() < 0.2
+    assert result.diagnosis.folds.item() == 0
+
+
+def test_landmarks_and_images_are_combined():
+    shape = (64, 80)
+    grid, moving = Grid(shape), blobs(shape, 1)
+    truth = bend(grid, 3.0)
+    points, ends = landmarks(truth, grid)
+    fixed = warp(moving, truth, grid)
+    climb = replace(QUICK, tolerance=0.0)  # all steps, so that the ends can be compared
+    after, similar = [], []
+    for weight in (0.0, 0.001, 1.0):
+        guidance = Guidance(fixed_points=points, moving_points=ends + 1.5)
+        result = register(fixed, moving, replace(climb, points_weight=weight), guidance=guidance)
+        after.append(result.evaluation.after.distances.mean().item())
+        similar.append(result.similarity_after.item())
+    assert after[0] > after[1] > after[2]
+    assert similar[0] > similar[1] > similar[2]
+    plain = register(fixed, moving, climb)  # weight 0 only measures
+    assert similar[0] == plain.similarity_after.item()
+
+
+@pytest.mark.parametrize("shape", [(48, 56), (24, 28, 26)])
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_landmarks_that_contradict_each_other_do_not_make_it_fold(shape, symmetric):
+    grid, moving = Grid(shape), blobs(shape, 1)
+    points, _ = landmarks(torch.zeros(1, grid.dim, *shape), grid)
+    guidance = Guidance(fixed_points=points, moving_points=points.flip(2))
+    settings = replace(QUICK, points_weight=100.0, symmetric=symmetric)
+    result = register(moving.flip(2), moving, settings, guidance=guidance)
+    assert result.diagnosis.folds.item() == 0
+    nearer = result.evaluation.after.distances.mean() < result.evaluation.before.distances.mean()
+    assert nearer or symmetric  # two maps bring the ends of a pair together in the middle, which says less
+
+
+@pytest.mark.parametrize("shape", [(6, 7), (4, 5, 6)])
+def test_spreading_is_the_transpose_of_interpolation(shape):
+    grid = Grid(shape, tuple(0.5 + 0.3 * k for k in range(len(shape))))
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(2, grid.dim, 9, generator=generator) * 1.2 - 0.1  # some outside
+    points = (points * torch.tensor(grid.extent).view(1, -1, 1)).double()
+    field = torch.randn(2, 3, *shape, generator=generator).double()
+    values = torch.randn(2, 3, 9, generator=generator).double()
+    at_points = (sample(field, points, grid) * values).flatten(1).sum(1)
+    at_nodes = (field * spread(values, points, grid)).flatten(1).sum(1)
+    torch.testing.assert_close(at_points, at_nodes)
