@@ -16,8 +16,8 @@ from torchdeform.pipeline.preflight import (
     NOTE,
     WARNING,
     Report,
+    flip_correlations,
     is_oblique,
-    likeness_turned_over,
     orientation,
     preflight,
 )
@@ -134,17 +134,17 @@ def test_the_header_explains_a_mirrored_array(dim):
     origin = (fixed.grid.extent[-1], *[0.0] * (dim - 1))
     stored = replace(fixed, data=fixed.data.flip(-1), direction=tuple(map(tuple, sign)), origin=origin)
     assert preflight(fixed, stored).findings == ()
-    scores = likeness_turned_over(fixed, stored)
+    scores = flip_correlations(fixed, stored)
     assert max(scores, key=lambda signs: scores[signs]) == (1.0,) * dim
 
 
-def test_likeness_of_blocks_keeps_the_place():
+def test_correlation_of_blocks_keeps_the_place():
     """Coarse grids of a fine and a coarse copy of one image lie on each other."""
     fixed = lopsided(2)
     fine = torch.nn.functional.interpolate(fixed.data, scale_factor=5, mode="bilinear", align_corners=True)
     spacing = tuple(s / (n - 1) for s, n in zip(fixed.grid.extent, fine.shape[2:], strict=True))
     moving = Image(fine, Grid(tuple(fine.shape[2:]), spacing))
-    assert likeness_turned_over(fixed, moving)[1.0, 1.0] > 0.99
+    assert flip_correlations(fixed, moving)[1.0, 1.0] > 0.99
 
 
 def a_mask(image: Image, values: torch.Tensor, **how) -> Image:

@@ -27,7 +27,7 @@ from torchdeform.deformation.versions import grid_from_target_monitor
 from torchdeform.deformation.volumes import simulate_volume_change
 from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.io import read_displacement, read_image, write_displacement, write_image, write_transform
-from torchdeform.io.files import require_writable, staged
+from torchdeform.io.files import atomic_folder, require_writable
 from torchdeform.io.images import ending_like
 from torchdeform.report.grids import write_grids
 from torchdeform.report.record import versions, write_json
@@ -109,7 +109,7 @@ def adapt_grid_to_file(image: Path, out: Path, settings: GridSettings, device: t
         "determinant_error_mean": error.mean().item(),
         "determinant_error_max": error.max().item(),
     }
-    with staged(out) as folder:
+    with atomic_folder(out) as folder:
         write_displacement(u.cpu(), picture, folder / "displacement.nii.gz")
         write_image(replace(picture, data=f.cpu(), pixel_type="float32"), folder / "monitor.nii.gz")
         write_grids(folder / "grid.png", {"adapted grid": points.cpu()}, _grey(picture))
@@ -156,7 +156,7 @@ def reconstruct_file(
         "misfit": solution.misfit.item(),
     }
     shots = [] if solution.trajectory is None else list(solution.trajectory.cpu())
-    with staged(out) as folder:
+    with atomic_folder(out) as folder:
         write_displacement(solution.value.cpu(), given, folder / "displacement.nii.gz")
         for step, shot in enumerate(shots, start=1):
             write_displacement(shot, given, folder / f"step_{step:0{len(str(len(shots)))}}.nii.gz")
@@ -220,7 +220,7 @@ def simulate_file(
     }
     changed = replace(picture, data=resample(picture, picture, back, outside=None).to(picture.data.dtype))
     moved = replace(regions, data=resample(regions, regions, back, mode="nearest", outside=None).to(values.dtype))
-    with staged(out) as folder:
+    with atomic_folder(out) as folder:
         write_image(changed, folder / f"simulated{ending_like(image, changed)}")
         write_image(moved, folder / f"labels{ending_like(labels, moved)}")
         write_displacement(back, picture, folder / "displacement.nii.gz")

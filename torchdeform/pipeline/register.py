@@ -13,7 +13,7 @@ from torchdeform.core.resampling import restrict
 from torchdeform.core.transform import Transform
 from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.io import read_image, write_displacement, write_image, write_transform
-from torchdeform.io.files import require_writable, staged
+from torchdeform.io.files import atomic_folder, require_writable
 from torchdeform.io.images import ending_like
 from torchdeform.io.labels import read_labels, write_labels
 from torchdeform.io.points import matched, read_points
@@ -28,7 +28,7 @@ from torchdeform.report.command_lines import repeat_command
 from torchdeform.report.figures import write_overview
 from torchdeform.report.page import write_report
 from torchdeform.report.record import describe, write_json
-from torchdeform.report.report_data import make_scene
+from torchdeform.report.report_data import make_report_data
 
 DEVICES = ("auto", "cpu", "cuda")
 RECORD = "result.json"
@@ -246,16 +246,16 @@ def _publish(files: PairFiles, inputs: Inputs, result: RegistrationResult, run: 
     """Write every file of a result into the folder, all of them or none."""
     out, start = files.out, perf_counter()
     former = _former_files(out)
-    with staged(out) as folder:
+    with atomic_folder(out) as folder:
         _write_images(folder, files, inputs, result)
         written = perf_counter()
-        scene = make_scene(inputs.fixed, inputs.moving, result)
-        write_overview(folder / "overview.png", scene)
+        data = make_report_data(inputs.fixed, inputs.moving, result)
+        write_overview(folder / "overview.png", data)
         names = (*sorted([*(path.name for path in folder.iterdir()), REPORT]), RECORD)
         run.seconds.update(result.seconds, write=written - start, draw=perf_counter() - written)
         run.held["draw"] = peak()
         record = _record(files, inputs, result, run) | {"files": names}
-        write_report(folder / REPORT, scene, record)
+        write_report(folder / REPORT, data, record)
         write_json(record, folder / RECORD)
     for name in former - set(names):
         (out / name).unlink(missing_ok=True)

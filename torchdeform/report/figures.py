@@ -29,7 +29,7 @@ from torchdeform.report.drawing import (
     volume_scale,
 )
 from torchdeform.report.planes import Plane, planes_of
-from torchdeform.report.report_data import Scene, Slices, to_unit
+from torchdeform.report.report_data import ReportData, Slices, to_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,30 +40,30 @@ _SHEET = {2: (2, 4), 3: (3, 7)}  # rows and columns of panels
 _PANEL_INCHES = {2: 3.2, 3: 2.3}
 _GRID_LINES = {2: 36, 3: 24}
 
-Draw = Callable[["Axes", Scene, Slices], None]
+Draw = Callable[["Axes", ReportData, Slices], None]
 
 
-def write_overview(path: Path, scene: Scene) -> None:
+def write_overview(path: Path, data: ReportData) -> None:
     """Draw a registration as a PNG: images, differences, the deformed grid and log J; in 3D three middle planes.
 
     Args:
         path: the file to write.
-        scene: what `make_scene` returns.
+        data: what `make_report_data` returns.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    result, dim = scene.result, scene.result.grid.dim
+    result, dim = data.result, data.result.grid.dim
     rows, columns = _SHEET[dim]
     width = _PANEL_INCHES[dim]
-    shapes = [cuts.plane.height_over_width for cuts in scene.slices]
+    shapes = [cuts.plane.height_over_width for cuts in data.slices]
     heights = [width * min(2.0, max(0.4, shape)) for shape in shapes] * (rows // len(shapes))
     figure = Figure((columns * width, sum(heights) + 0.3 * rows + 0.4), dpi=110, layout="constrained", facecolor=PAPER)
     cells = figure.subplots(rows, columns, squeeze=False, height_ratios=heights).flat
-    for cuts, (title, draw) in product(scene.slices, _PANELS.items()):
+    for cuts, (title, draw) in product(data.slices, _PANELS.items()):
         axes = next(cells)
-        draw(axes, scene, cuts)
-        axes.set_title(_title(title, result) if cuts is scene.slices[0] else "", fontsize=10, color=INK)
+        draw(axes, data, cuts)
+        axes.set_title(_title(title, result) if cuts is data.slices[0] else "", fontsize=10, color=INK)
     for axes in cells:
         draw_convergence(axes, result)
         axes.set_title(f"{measure_name(result)} over the steps", fontsize=10, color=INK)
@@ -90,27 +90,27 @@ def _headline(result: "RegistrationResult") -> str:
 
 
 def _draw_image(name: str) -> Draw:
-    def draw(axes: "Axes", scene: Scene, cuts: Slices) -> None:
+    def draw(axes: "Axes", data: ReportData, cuts: Slices) -> None:
         draw_image(axes, cuts.plane, cuts.fields[name][cuts.middle])
 
     return draw
 
 
 def _draw_difference(name: str) -> Draw:
-    def draw(axes: "Axes", scene: Scene, cuts: Slices) -> None:
-        draw_map(axes, cuts.plane, cuts.fields[name][cuts.middle], difference_scale(scene.limits[name]), bar=False)
+    def draw(axes: "Axes", data: ReportData, cuts: Slices) -> None:
+        draw_map(axes, cuts.plane, cuts.fields[name][cuts.middle], difference_scale(data.limits[name]), bar=False)
 
     return draw
 
 
-def _draw_grid(axes: "Axes", scene: Scene, cuts: Slices) -> None:
+def _draw_grid(axes: "Axes", data: ReportData, cuts: Slices) -> None:
     """Draw where φ takes the lines of a regular grid, over the moving image it takes them to."""
     draw_faint(axes, cuts.plane, cuts.fields["moving"][cuts.middle])
     draw_lines(axes, cuts.plane, cuts.fields["u"][cuts.middle], _GRID_LINES[cuts.plane.grid.dim])
 
 
-def _draw_volume(axes: "Axes", scene: Scene, cuts: Slices) -> None:
-    draw_map(axes, cuts.plane, cuts.fields["log_det"][cuts.middle], volume_scale(scene.limits["log_det"]))
+def _draw_volume(axes: "Axes", data: ReportData, cuts: Slices) -> None:
+    draw_map(axes, cuts.plane, cuts.fields["log_det"][cuts.middle], volume_scale(data.limits["log_det"]))
 
 
 _PANELS: dict[str, Draw] = {

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchdeform.report.pictures import fitting_pictures
 from torchdeform.report.record import describe
-from torchdeform.report.report_data import Scene
+from torchdeform.report.report_data import ReportData
 from torchdeform.report.tables import command_lines, file_name, footer, tables, tiles
 from torchdeform.report.verdict import BAD, DOUBTFUL, GOOD, judge
 
@@ -17,15 +17,15 @@ _MARKS = {GOOD: "✓", DOUBTFUL: "!", BAD: "✗"}
 _MODES = {"swipe": "swipe", "flicker": "flicker", "checkerboard": "checkerboard", "overlay": "two colours"}
 
 
-def write_report(path: Path, scene: Scene, record: Mapping[str, Any] | None = None) -> None:
+def write_report(path: Path, data: ReportData, record: Mapping[str, Any] | None = None) -> None:
     """Write a page with everything that tells whether a registration went well: no network, less than 5 MB.
 
     Args:
         path: the file to write, usually ``report.html``.
-        scene: what `make_scene` returns; its slices are those the page can show.
-        record: what ``result.json`` holds; `describe` of the scene's result when None, which knows no commands.
+        data: what `make_report_data` returns; its slices are those the page can show.
+        record: what ``result.json`` holds; `describe` of the result when None, which knows no commands.
     """
-    known = describe(scene.result, scene.fixed, scene.moving) if record is None else record
+    known = describe(data.result, data.fixed, data.moving) if record is None else record
     page = _render(
         verdict=judge(known),
         marks=_MARKS,
@@ -36,7 +36,7 @@ def write_report(path: Path, scene: Scene, record: Mapping[str, Any] | None = No
         tables=tables(known),
         commands=command_lines(known),
         footer=footer(known),
-        **fitting_pictures(scene),
+        **fitting_pictures(data),
     )
     path.write_text(page, encoding="utf-8")
 

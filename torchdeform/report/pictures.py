@@ -15,8 +15,18 @@ from torchdeform.report.drawing import (
     signed_scale,
     volume_scale,
 )
-from torchdeform.report.report_data import Scene, Slices
-from torchdeform.report.web_images import UNITS, Frame, colours, curve, frame_of, grey_levels, grid_paths, sprite, stops
+from torchdeform.report.report_data import ReportData, Slices
+from torchdeform.report.web_images import (
+    UNITS,
+    Frame,
+    colours,
+    curve,
+    frame_of,
+    grey_levels,
+    grid_paths,
+    image_strip,
+    stops,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,18 +35,18 @@ if TYPE_CHECKING:
 _SIZES = {2: ((900, 88), (700, 80), (500, 70), (350, 50)), 3: ((256, 85), (224, 75), (192, 60), (144, 40))}
 _MOST = 4_200_000  # characters of all pictures together
 _GRID_LINES = {2: 40, 3: 28}
-_CURL = {2: "Curl", 3: "Length of the curl"}
+
 _CURVE_INCHES = (5.2, 2.5)
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One figure of the page, as sprites or as paths of lines by plane, and what it means."""
+    """One figure of the page, as strips or as paths of lines by plane, and what it means."""
 
     name: str
     title: str
     caption: str
-    sprites: Mapping[str, str] = field(default_factory=dict)
+    strips: Mapping[str, str] = field(default_factory=dict)
     paths: Mapping[str, list[str]] = field(default_factory=dict)
     bar: str = ""
     ticks: tuple[Mapping[str, object], ...] = ()
@@ -44,12 +54,12 @@ class Picture:
     @property
     def size(self) -> int:
         """Characters on the page."""
-        return sum(map(len, self.sprites.values())) + sum(len(p) for paths in self.paths.values() for p in paths)
+        return sum(map(len, self.strips.values())) + sum(len(p) for paths in self.paths.values() for p in paths)
 
 
-def fitting_pictures(scene: Scene) -> dict[str, object]:
-    """Return what the template needs to show a scene, in the best quality that fits the page."""
-    painters = (_Painter(scene, *size) for size in _SIZES[scene.result.grid.dim])
+def fitting_pictures(data: ReportData) -> dict[str, object]:
+    """Return what the template needs to show a registration, in the best quality that fits the page."""
+    painters = (_Painter(data, *size) for size in _SIZES[data.result.grid.dim])
     painter = next(painters)
     while True:
         pictures = painter.pictures()
@@ -62,27 +72,27 @@ def fitting_pictures(scene: Scene) -> dict[str, object]:
         "planes": planes,
         "wide": round(sum(plane["shape"] for plane in planes), 3),
         "data": {plane["name"]: {key: plane[key] for key in ("positions", "labels")} for plane in planes},
-        "choices": [{"name": name, "title": title} for name, title in _others(scene).items()],
+        "choices": [{"name": name, "title": title} for name, title in _others(data).items()],
         "differences": pictures.pop("Differences"),
         "groups": pictures,
-        "curves": _curves(scene),
+        "curves": _curves(data),
         "dense": len(planes) > 1,
     }
 
 
-def _others(scene: Scene) -> dict[str, str]:
+def _others(data: ReportData) -> dict[str, str]:
     """Return what the fixed image can be compared with."""
-    aligned = scene.result.affine is not None
+    aligned = data.result.affine is not None
     titles = {"warped": "warped", "moving": "moving, aligned" if aligned else "moving", "original": "moving, as it was"}
-    return {name: title for name, title in titles.items() if name in scene.slices[0].fields}
+    return {name: title for name, title in titles.items() if name in data.slices[0].fields}
 
 
 class _Painter:
-    """Paints a scene's slices in one size and quality."""
+    """Paints the slices in one size and quality."""
 
-    def __init__(self, scene: Scene, largest: int, quality: int) -> None:
-        self._scene, self._quality = scene, quality
-        self._parts = [(cuts, frame_of(cuts.plane, len(cuts.numbers), largest)) for cuts in scene.slices]
+    def __init__(self, data: ReportData, largest: int, quality: int) -> None:
+        self._data, self._quality = data, quality
+        self._parts = [(cuts, frame_of(cuts.plane, len(cuts.numbers), largest)) for cuts in data.slices]
 
     def planes(self) -> list[dict[str, Any]]:
         """Return what the page knows of each plane."""
@@ -90,22 +100,22 @@ class _Painter:
 
     def pictures(self) -> dict[str, list[Picture]]:
         """Return all pictures, in groups."""
-        scale = difference_scale(self._scene.limits["before"])
-        titles = {"fixed": "fixed", **_others(self._scene)}
+        scale = difference_scale(self._data.limits["before"])
+        titles = {"fixed": "fixed", **_others(self._data)}
         return {
             "Differences": [
                 self._map("before", "Difference before the deformation", scale),
                 self._map("after", "Difference after it", scale),
             ],
             "Images": [
-                Picture(name, title.capitalize(), _ABOUT[name], self._sprites(name, None))
+                Picture(name, title.capitalize(), _ABOUT[name], self._strips(name, None))
                 for name, title in titles.items()
             ],
             "The map": list(self._maps()),
         }
 
     def _maps(self) -> Iterator[Picture]:
-        limits, dim = self._scene.limits, self._scene.result.grid.dim
+        limits, dim = self._data.limits, self._data.result.grid.dim
         paths = {cuts.plane.name: grid_paths(cuts, frame, _GRID_LINES[dim]) for cuts, frame in self._parts}
         yield Picture("grid", "Grid moved by the map", _ABOUT["grid"], paths=paths)
         yield self._map("log_det", "Volume: moving / fixed", volume_scale(limits["log_det"]))
@@ -121,15 +131,15 @@ class _Painter:
             {"place": round(100 * (value - scale.low) / (scale.high - scale.low), 2), "text": text}
             for value, text in scale.ticks
         )
-        return Picture(name, title, _ABOUT[name], self._sprites(name, scale), bar=stops(scale), ticks=ticks)
+        return Picture(name, title, _ABOUT[name], self._strips(name, scale), bar=stops(scale), ticks=ticks)
 
-    def _sprites(self, name: str, scale: Scale | None) -> dict[str, str]:
+    def _strips(self, name: str, scale: Scale | None) -> dict[str, str]:
         """Return a field's slices of every plane as data URIs."""
         found = {}
         for cuts, frame in self._parts:
             values = cuts.fields[name]
             pixels = grey_levels(values) if scale is None else colours(values, scale)
-            found[cuts.plane.name] = sprite(pixels, cuts.plane, frame, self._quality)
+            found[cuts.plane.name] = image_strip(pixels, cuts.plane, frame, self._quality)
         return found
 
 
@@ -161,19 +171,19 @@ def _plane(cuts: Slices, frame: Frame) -> dict[str, Any]:
     }
 
 
-def _curves(scene: Scene) -> list[dict[str, object]]:
+def _curves(data: ReportData) -> list[dict[str, object]]:
     """Return the histogram of volumes, and the similarity over the steps."""
     from markupsafe import Markup
 
     def volumes(axes: "Axes") -> None:
-        draw_volumes(axes, scene.volumes, scene.limits["log_det"])
+        draw_volumes(axes, data.volumes, data.limits["log_det"])
 
     def convergence(axes: "Axes") -> None:
-        draw_convergence(axes, scene.result)
+        draw_convergence(axes, data.result)
 
     about = {
         "Volumes": ("How often each change of volume occurs, over all voxels.", volumes),
-        "Convergence": (f"Similarity ({measure_name(scene.result)}) over the steps, by level.", convergence),
+        "Convergence": (f"Similarity ({measure_name(data.result)}) over the steps, by level.", convergence),
     }
     return [
         {"title": title, "caption": caption, "svg": Markup(curve(title, draw, *_CURVE_INCHES))}

@@ -47,7 +47,7 @@ class Slices:
 
 
 @dataclass(frozen=True)
-class Scene:
+class ReportData:
     """Everything that is drawn of one pair, on the CPU.
 
     Attributes:
@@ -67,7 +67,7 @@ class Scene:
     volumes: Tensor
 
 
-def make_scene(fixed: Image, moving: Image, result: RegistrationResult, *, slices: int = 15) -> Scene:
+def make_report_data(fixed: Image, moving: Image, result: RegistrationResult, *, slices: int = 15) -> ReportData:
     """Cut what is to be drawn of a registration.
 
     Args:
@@ -77,18 +77,18 @@ def make_scene(fixed: Image, moving: Image, result: RegistrationResult, *, slice
         slices: how many of each plane at most, at equal distances, the middle one among them.
 
     Returns:
-        `Scene`, on the CPU.
+        `ReportData`, on the CPU.
     """
     fixed, moving = fixed.to("cpu"), moving.to("cpu")
     fields = rates(result.displacement.detach().cpu(), fixed.grid)
     fields["log_det"] = log_volume(fields.pop("determinant"))
-    eyes = _Eyes(fixed, moving, result)
+    sampler = _SliceSampler(fixed, moving, result)
     stacks = []
     for plane in planes_of(fixed):
         numbers = spread(plane, slices)
-        stacks.append(Slices(plane, numbers, eyes.look(plane, numbers) | _cut(fields, plane, numbers)))
+        stacks.append(Slices(plane, numbers, sampler.sample(plane, numbers) | _cut(fields, plane, numbers)))
     limits = _limits(fields, stacks)
-    return Scene(tuple(stacks), fixed, moving, result, limits, volume_counts(fields["log_det"], limits["log_det"]))
+    return ReportData(tuple(stacks), fixed, moving, result, limits, volume_counts(fields["log_det"], limits["log_det"]))
 
 
 def spread(plane: Plane, count: int) -> tuple[int, ...]:
@@ -110,7 +110,7 @@ def _limits(fields: dict[str, Tensor], stacks: list[Slices]) -> dict[str, float]
     return limits | {"after": limits["before"]}
 
 
-class _Eyes:
+class _SliceSampler:
     """The images and maps of a pair, looked at in slices: only the points of the slices are sampled."""
 
     def __init__(self, fixed: Image, moving: Image, result: RegistrationResult) -> None:
@@ -127,7 +127,7 @@ class _Eyes:
             "u": self._u,
         }
 
-    def look(self, plane: Plane, numbers: Sequence[int]) -> dict[str, Tensor]:
+    def sample(self, plane: Plane, numbers: Sequence[int]) -> dict[str, Tensor]:
         """Return slices of the images, the differences, the displacement and the error of the inverse."""
         points = plane.points(numbers)
         found = _cut(self._still, plane, numbers)
@@ -205,7 +205,7 @@ def quantiles(values: Tensor, *percent: float) -> list[float]:
     """Return percentiles of at most about a million values, taken at regular steps."""
     flat = values.reshape(-1)
     some = flat[:: 1 + flat.numel() // 2**20]
-    finite = some[some.isfinite()]
+    finite = some[some.isfinite()].cpu()
     return [float(q) for q in np.percentile(finite.numpy(), percent)] if len(finite) else [0.0] * len(percent)
 
 

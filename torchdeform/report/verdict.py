@@ -44,7 +44,7 @@ def judge(record: Record) -> Verdict:
         record: what `describe` returns, with ``warnings`` where there are some.
 
     Notes:
-        No figure proves that the right tissue lies on the right tissue; only labels, landmarks and eyes can tell.
+        No figure proves that the right tissue lies on the right tissue; labels, landmarks or a look can tell.
     """
     found = [_folds(record), _similarity(record), *_labels(record), *_landmarks(record), *_map(record)]
     found += [Finding(DOUBTFUL, f"Warning: {text}") for text in record.get("warnings", ())]

@@ -78,7 +78,7 @@ def _table(scale: Scale) -> Bytes:
     return (colormaps[scale.colours](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
 
 
-def sprite(pixels: Bytes, plane: Plane, frame: Frame, quality: int) -> str:
+def image_strip(pixels: Bytes, plane: Plane, frame: Frame, quality: int) -> str:
     """Return slices ``(n, h, w, 1 or 3)`` below each other, turned for the eye, as a JPEG in a data URI."""
     from PIL import Image as Picture
 
