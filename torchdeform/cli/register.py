@@ -25,8 +25,8 @@ from torchdeform.metrics.similarity import similarity_weights
 from torchdeform.pipeline.config import load_settings, parse_override, preset_names
 from torchdeform.pipeline.memory import parse_size
 from torchdeform.pipeline.register import REPORT, Outcome, PairFiles, register_files
+from torchdeform.registration.affine.settings import ALIGNMENTS
 from torchdeform.registration.result import Progress as Step
-from torchdeform.registration.settings import ALIGNMENTS
 
 Fixed = Annotated[
     Path,
@@ -136,7 +136,7 @@ def register(
 
 def summary(outcome: Outcome) -> str:
     """Return what a person wants to know of a registration, in a few lines."""
-    r, measure = outcome.record, " + ".join(similarity_weights(outcome.result.settings.similarity))
+    r, measure = outcome.record, " + ".join(similarity_weights(outcome.result.settings.similarity.measure))
     lines = {
         f"similarity ({measure})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
         "folds": f"{r['folds']}, determinant {r['determinant_min']:.3g} to {r['determinant_max']:.3g}",

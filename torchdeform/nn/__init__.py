@@ -11,11 +11,13 @@ from torchdeform.nn.losses import (
     InverseConsistencyLoss,
     SimilarityLoss,
 )
+from torchdeform.nn.registration import DeformableRegistration
 from torchdeform.nn.spatial import SpatialTransformer
 from torchdeform.nn.velocity import DivCurlVelocity, FlowIntegrator
 
 __all__ = [
     "CurlLoss",
+    "DeformableRegistration",
     "DeterminantLoss",
     "DiceLoss",
     "DivCurlVelocity",

@@ -198,7 +198,7 @@ def _cycle(colours: Sequence[str], count: int) -> list[str]:
 
 def measure_name(result: RegistrationResult) -> str:
     """Return the similarity that was used, or those that were."""
-    return " + ".join(similarity_weights(result.settings.similarity))
+    return " + ".join(similarity_weights(result.settings.similarity.measure))
 
 
 def tinted(first: Floats, second: Floats) -> Floats:

@@ -1,7 +1,6 @@
 """Alignment: the rigid, similarity or affine map of the world that brings two images together, from any start."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -19,16 +18,10 @@ from torchdeform.metrics.similarity import Similarity, features, make_similarity
 from torchdeform.registration.affine.lie import generators
 from torchdeform.registration.affine.objective import Frame, Level, Masked
 from torchdeform.registration.affine.search import Candidate, Found, climbed, search
-from torchdeform.registration.settings import ALIGNMENTS
+from torchdeform.registration.affine.settings import ALIGNMENTS, COARSEST_NODES, AlignmentSettings
 
-# Nodes of the coarsest level at most, where all starts are tried, and how much finer a level is tried for the finest.
-_COARSEST = 4096
+# How much finer a level is tried for the finest.
 _FINER = 1.02
-
-# Nodes of the finest level and width of the LNCC window where nothing else is asked for. In 2D finer levels made the
-# map worse (brain slices, tissue sections): one part fits in every detail, and the rest, which bends, goes with it.
-_NODES = {2: 20_000, 3: 150_000}
-_WINDOW = {2: 7, 3: 5}
 
 # Voxels around a mask that belong to the picture.
 _MARGIN = 4
@@ -45,53 +38,6 @@ _SAME_SIZE = 1.05
 # An overlap, and changes of length, that are worth a warning.
 _LITTLE_OVERLAP = 0.5
 _LENGTHS = (0.5, 2.0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class AlignmentSettings:
-    """How images are aligned.
-
-    Args:
-        similarity: name, or names with weights, as in `RegistrationSettings`. ``lncc`` alone is `DetailCorrelation`,
-            which also finds maps between many different contrasts; ``nmi`` is for those it does not. ``mind`` suits
-            tissue sections that turn little.
-        window: width of the LNCC window in voxels of each level, odd; 7 in 2D and 5 in 3D when None.
-        rotations: try rotations all around, and mirror images, at the coarsest level; otherwise only the files'
-            geometry and the centres are starts, which finds rotations up to some 30°.
-        nodes: nodes of the finest level at most, 20 000 in 2D and 150 000 in 3D when None. More take longer, and are
-            better only where one affine map fits everything.
-        min_overlap: share of the smaller image (or mask) that must lie in the other one.
-        steps: evaluations of the similarity at most on each level.
-
-    Raises:
-        InputError: a value out of range, named.
-    """
-
-    similarity: str | Mapping[str, float] = "lncc"
-    window: int | None = None
-    rotations: bool = True
-    nodes: int | None = None
-    min_overlap: float = 0.3
-    steps: int = 40
-
-    def __post_init__(self) -> None:
-        similarity_weights(self.similarity)
-        if self.window is not None and (self.window < 3 or self.window % 2 == 0):
-            raise InputError(f"window must be an odd number of voxels, at least 3, got {self.window}")
-        if not 0 < self.min_overlap <= 1:
-            raise InputError(f"min_overlap must lie between 0 and 1, got {self.min_overlap}")
-        if self.nodes is not None and self.nodes < _COARSEST:
-            raise InputError(f"nodes must be at least {_COARSEST}, got {self.nodes}")
-        if self.steps < 1:
-            raise InputError(f"steps must be at least 1, got {self.steps}")
-
-    def window_in(self, dim: int) -> int:
-        """Return the width of the window for images of ``dim`` axes."""
-        return self.window or _WINDOW[dim]
-
-    def nodes_in(self, dim: int) -> int:
-        """Return the nodes of the finest level at most for images of ``dim`` axes."""
-        return self.nodes or _NODES[dim]
 
 
 @dataclass(frozen=True)
@@ -121,7 +67,7 @@ class Alignment:
 def align(
     fixed: Image,
     moving: Image,
-    kind: str = "affine",
+    kind: str | None = None,
     *,
     fixed_mask: Image | None = None,
     moving_mask: Image | None = None,
@@ -132,7 +78,7 @@ def align(
     Args:
         fixed: image that stays, grey or colour.
         moving: image to be aligned with it; another grid, direction or spacing does not matter.
-        kind: ``none``, ``translation``, ``rigid`` (rotation and shift), ``similarity`` (and one scale) or ``affine``.
+        kind: as `AlignmentSettings`, whose ``kind`` it is when None.
         fixed_mask: where the fixed image counts, not 0; anywhere in the world.
         moving_mask: the same for the moving image.
         settings: defaults when None.
@@ -153,6 +99,7 @@ def align(
         Runs on the images' device, in float32; not differentiable, see `affine_warp`.
     """
     settings, began = settings or AlignmentSettings(), perf_counter()
+    kind = settings.kind if kind is None else kind
     require_choice(kind, ALIGNMENTS, "align: kind")
     pair = _prepared((fixed, fixed_mask), (moving, moving_mask), settings)
     frame = Frame.of(pair[0].image)
@@ -306,7 +253,7 @@ def _levels(fixed: Masked, moving: Masked, frame: Frame, settings: AlignmentSett
         levels.insert(0, _level(fixed, moving, frame, settings))
         voxel *= 2
         shape = fixed.image.grid.shape
-        if math.prod(shape) <= _COARSEST or with_voxels(fixed.image.grid, voxel).shape == shape:
+        if math.prod(shape) <= COARSEST_NODES or with_voxels(fixed.image.grid, voxel).shape == shape:
             return levels
 
 
