@@ -18,7 +18,7 @@ def test_planes_show_the_patient_upright(make_image):
         (((0, 0, 1), (1, 0, 0), (0, 1, 0)), [(2, False), (1, True), (1, True)]),
     ):
         image = Image(grid_image.data, grid_image.grid, direction=direction)
-        assert [(plane.axes[0], plane.turned[0]) for plane in planes_of(image)] == vertical
+        assert [(plane.axes[0], plane.flipped[0]) for plane in planes_of(image)] == vertical
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -82,7 +82,7 @@ def image_strip(pixels: Bytes, plane: Plane, frame: Frame, quality: int) -> str:
     """Return slices ``(n, h, w, 1 or 3)`` below each other, turned for the eye, as a JPEG in a data URI."""
     from PIL import Image as Picture
 
-    turned = pixels[:, :: -1 if plane.turned[0] else 1, :: -1 if plane.turned[1] else 1]
+    turned = pixels[:, :: -1 if plane.flipped[0] else 1, :: -1 if plane.flipped[1] else 1]
     rows = [np.asarray(_resized(flat.squeeze(-1) if flat.shape[-1] == 1 else flat, frame)) for flat in turned]
     padding = ((_MARGIN, _MARGIN), (0, 0), (0, 0))
     sheet = np.concatenate([np.pad(row, padding[: row.ndim], mode="edge") for row in rows])
@@ -109,7 +109,7 @@ def _path(lines: Sequence[NDArray[np.floating]], plane: Plane, frame: Frame) -> 
     size = np.array((UNITS * frame.across / across, UNITS * frame.down / down))
     parts = []
     for line in lines:
-        turned = np.where(plane.turned[::-1], np.array((across, down)) - 1 - line, line)
+        turned = np.where(plane.flipped[::-1], np.array((across, down)) - 1 - line, line)
         steps = _thinned(((turned + 0.5) * size).round().astype(int))
         parts.append("M" + "l".join(f"{x} {y}" for x, y in steps.tolist()))
     return "".join(parts).replace(" -", "-")
