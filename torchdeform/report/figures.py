@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image, luminance
+from torchdeform.core.image import Image, box_corners, luminance
 from torchdeform.core.warp import sample
 from torchdeform.report.drawing import (
     INK,
@@ -125,7 +125,6 @@ _PANELS: dict[str, Draw] = {
 
 
 _INCHES = {2: 3.2, 3: 2.2}  # width of a panel
-_PERCENTILES = (0.005, 0.995)
 
 
 def write_gallery(path: Path, images: Mapping[str, Image]) -> None:
@@ -155,9 +154,7 @@ def write_gallery(path: Path, images: Mapping[str, Image]) -> None:
 def _grey(image: Image) -> Image:
     """Return an image as grey values from 0 to 1."""
     grey = luminance(image).data.float().cpu()
-    values = grey.flatten().sort().values
-    low, high = (values[round(share * (len(values) - 1))] for share in _PERCENTILES)
-    return replace(image, data=((grey - low) / (high - low).clamp(min=1e-12)).clamp(0, 1))
+    return replace(image, data=to_unit(grey, grey))
 
 
 _OUTLINES = ("#0b5fa5", "#b34700")
@@ -215,7 +212,7 @@ def _cuts(fixed: Image, moving: Image) -> list[_Cut]:
 
 def _canvas(fixed: Image, moving: Image) -> Image:
     """Return an empty image along the fixed one's axes, its middle there, that holds both (unless one is far off)."""
-    corners = fixed.to_grid(moving.to_world(_corners(moving.grid)))[0]
+    corners = fixed.to_grid(moving.to_world(box_corners(moving.grid)))[0]
     middle, width = [side / 2 for side in fixed.grid.extent], []
     for k, side in enumerate(fixed.grid.extent):
         reach = max(float((corners[k] - middle[k]).abs().max()), side / 2)
@@ -226,10 +223,6 @@ def _canvas(fixed: Image, moving: Image) -> Image:
     first = torch.tensor([m - w / 2 for m, w in zip(middle, width, strict=True)], dtype=torch.float64)
     origin = fixed.to_world(first.view(1, -1, 1))[0, :, 0].tolist()
     return replace(fixed, data=torch.zeros(()).expand(1, 1, *shape), grid=grid, origin=tuple(origin))
-
-
-def _corners(grid: Grid) -> Tensor:
-    return torch.tensor(list(product(*((0.0, side) for side in grid.extent))), dtype=torch.float64).T.unsqueeze(0)
 
 
 def _cut(plane: Plane, canvas: Image, images: tuple[Image, Image]) -> _Cut:
