@@ -6,12 +6,21 @@ from dataclasses import asdict, replace
 import pytest
 import torch
 
+from torchdeform.cohort.estimate import estimate
+from torchdeform.cohort.plan import Job
 from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.core.warp import warp
 from torchdeform.errors import InputError
+from torchdeform.io import write_image
 from torchdeform.metrics.mind import mind_ssc
-from torchdeform.metrics.similarity import SIMILARITIES, features, make_similarity, on_one_scale, similarity_weights
+from torchdeform.metrics.similarity import MEASURES, features, make_similarity, needs_common_scale, similarity_weights
+from torchdeform.nn import SimilarityLoss
+from torchdeform.pipeline.citations import citations
 from torchdeform.pipeline.config import load_settings
+from torchdeform.pipeline.memory import footprint
+from torchdeform.pipeline.register import PairFiles
+from torchdeform.registration.affine.align import AlignmentSettings
 from torchdeform.registration.deformable import register
 from torchdeform.registration.settings import RegistrationSettings
 
@@ -67,9 +76,9 @@ def test_the_derivative_of_a_combination_is_that_of_its_value(weights):
 
 
 def test_only_a_squared_difference_of_intensities_needs_one_scale():
-    assert [name for name in SIMILARITIES if on_one_scale(name)] == ["ssd"]
-    assert on_one_scale({"mi": 1, "ssd": 0.1})
-    assert not on_one_scale({"mi": 1, "mind": 0.1})
+    assert [name for name in MEASURES if needs_common_scale(name)] == ["ssd"]
+    assert needs_common_scale({"mi": 1, "ssd": 0.1})
+    assert not needs_common_scale({"mi": 1, "mind": 0.1})
 
 
 @pytest.mark.parametrize(
@@ -116,7 +125,7 @@ def test_weights_come_from_files_and_overrides(tmp_path):
     assert load_settings(file=file, overrides={"similarity": "mi"}).similarity == "mi"
 
 
-@pytest.mark.parametrize("similarity", [*SIMILARITIES, {"lncc": 1, "mind": 2}])
+@pytest.mark.parametrize("similarity", [*MEASURES, {"lncc": 1, "mind": 2}])
 def test_a_registration_climbs_it(similarity):
     """Waves bent by a known map are bent back, with another contrast for the measures that allow it."""
     grid = Grid((64, 60))
@@ -133,3 +142,23 @@ def test_a_registration_climbs_it(similarity):
     after = (result.displacement - truth).square().sum(1).sqrt().mean()
     assert after < 0.3 * before
     assert (result.similarity_after > result.similarity_before).all()
+
+
+def test_a_new_measure_is_a_new_row(monkeypatch, tmp_path):
+    """Whoever asks for a measure by name reads the table."""
+    row = replace(MEASURES["ncc"], memory=(1e4, 1e4), time=100.0, common_scale=True, references=("new",))
+    monkeypatch.setitem(MEASURES, "new", row)
+    settings, old = RegistrationSettings(similarity="new"), RegistrationSettings(similarity="ncc")
+    fixed, moving = (torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(k)) for k in (0, 1))
+    found = register(fixed, moving, replace(settings, steps=(2,)))
+    assert found.similarity_after > found.similarity_before
+    assert needs_common_scale("new")
+    assert AlignmentSettings(similarity="new").similarity == "new"
+    assert load_settings(overrides={"similarity": {"new": 2}}).similarity == {"new": 2.0}
+    assert SimilarityLoss("new")(fixed, moving) == SimilarityLoss("ncc")(fixed, moving)
+    assert footprint(Grid((64, 64)), 1, settings) > footprint(Grid((64, 64)), 1, old)
+    assert set(citations(settings)) - set(citations(old)) == {"new"}
+    write_image(Image(fixed, Grid((64, 64))), path := tmp_path / "a.nrrd")
+    files = PairFiles(fixed=path, moving=path, out=tmp_path)
+    slow, fast = (estimate([Job(name="a", files=files, settings=some)]).seconds for some in (settings, old))
+    assert slow > fast

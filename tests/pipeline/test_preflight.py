@@ -10,6 +10,7 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import read_image
+from torchdeform.pipeline.memory import footprint
 from torchdeform.pipeline.preflight import (
     ERROR,
     NOTE,
@@ -183,6 +184,18 @@ def test_memory_that_will_not_do(monkeypatch):
         assert "--memory" in texts(report, severity)
     monkeypatch.setattr("torchdeform.pipeline.preflight.available", lambda device: None)
     assert preflight(fixed, fixed).findings == ()
+
+
+def test_the_memory_of_what_will_be_registered(monkeypatch):
+    """Two maps take more than one, and a limit that is given is kept to, so nothing is said."""
+    fixed, one, both = lopsided(3), RegistrationSettings(), RegistrationSettings(symmetric=True)
+    between = (footprint(fixed.grid, 1, one) + footprint(fixed.grid, 1, both)) / 2
+    monkeypatch.setattr("torchdeform.pipeline.preflight.available", lambda device: between / 0.8)
+    assert preflight(fixed, fixed, settings=one).findings == ()
+    assert "of memory and" in texts(preflight(fixed, fixed, settings=both), WARNING)
+    monkeypatch.setattr("torchdeform.pipeline.preflight.available", lambda device: 10**8)
+    assert "of memory and" in texts(preflight(fixed, fixed), ERROR)
+    assert preflight(fixed, fixed, memory=10**9).findings == ()
 
 
 def test_errors_come_first():

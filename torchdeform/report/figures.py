@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image
+from torchdeform.core.image import Image, box_corners
 from torchdeform.core.warp import sample
 from torchdeform.report.drawing import (
     INK,
@@ -200,11 +200,10 @@ def _cuts(fixed: Image, moving: Image) -> list[_Cut]:
 
 def _canvas(fixed: Image, moving: Image) -> Image:
     """Return an empty image along the axes and around the middle of the fixed one, large enough for both if it can."""
-    corners = Grid((2,) * moving.grid.dim, moving.grid.extent).points(dtype=torch.float64)
-    reach = fixed.to_grid(moving.to_world(corners))[0].flatten(1)
+    corners = fixed.to_grid(moving.to_world(box_corners(moving.grid)))[0]
     middle, width = [side / 2 for side in fixed.grid.extent], []
     for k, side in enumerate(fixed.grid.extent):
-        farthest = max(float((reach[k] - middle[k]).abs().max()), side / 2)
+        farthest = max(float((corners[k] - middle[k]).abs().max()), side / 2)
         width.append(2 * min(farthest, _FARTHEST * side / 2) * 1.02)
     pixel = max(width) / _PIXELS
     shape = tuple(max(2, round(w / pixel) + 1) for w in width)
