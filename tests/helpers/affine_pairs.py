@@ -1,4 +1,4 @@
-"""One report_data of the world in two images on different grids, with the affine map between them."""
+"""One scene of the world in two images on different grids, with the affine map between them."""
 
 import math
 from dataclasses import replace
@@ -30,7 +30,7 @@ SPACINGS = {2: ((1.4, 1.2), (1.2, 1.3)), 3: ((2.0, 1.6, 1.4), (1.6, 1.7, 1.5))}
 SIDES = (60.0, 44.0, 36.0)
 
 
-def report_data(world: Tensor, count: int = 14) -> Tensor:
+def scene(world: Tensor, count: int = 14) -> Tensor:
     """A value for every world point: blobs of different width and height near the origin, no two places alike."""
     random = torch.Generator().manual_seed(0)
     dim = world.shape[1]
@@ -54,9 +54,9 @@ def empty(shape, spacing, *, centre=None, tilted=False) -> Image:
 
 
 def picture(place: Image, through: Affine | None = None) -> Image:
-    """The report_data on the grid of ``place``, each world point being taken through a map first."""
+    """The scene on the grid of ``place``, each world point being taken through a map first."""
     world = place.to_world(place.grid.points(dtype=torch.float64))
-    return replace(place, data=report_data(world if through is None else through(world)).float())
+    return replace(place, data=scene(world if through is None else through(world)).float())
 
 
 def make_pair(true: Affine, *, follow: bool = False, finer: float = 1.0) -> tuple[Image, Image]:

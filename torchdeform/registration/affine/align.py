@@ -1,7 +1,6 @@
 """Alignment: the rigid, similarity or affine map of the world that brings two images together, from any start."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -10,25 +9,19 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, luminance, require_registrable, resample
+from torchdeform.core.intensities import fill, to_common_scale
 from torchdeform.core.resampling import with_voxels
 from torchdeform.core.transform import Affine
-from torchdeform.core.warp import sample
 from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.metrics.correlation import DetailCorrelation
 from torchdeform.metrics.similarity import Similarity, features, make_similarity, needs_common_scale, similarity_weights
 from torchdeform.registration.affine.lie import generators
 from torchdeform.registration.affine.objective import Frame, Level, Masked
 from torchdeform.registration.affine.search import Candidate, Found, climbed, search
-from torchdeform.registration.settings import ALIGNMENTS
+from torchdeform.registration.affine.settings import ALIGNMENTS, COARSEST_NODES, AlignmentSettings
 
-# Nodes of the coarsest level at most, where all starts are tried, and how much finer a level is tried for the finest.
-_COARSEST = 4096
+# How much finer the next voxels are that are tried for the finest level.
 _FINER = 1.02
-
-# Nodes of the finest level and width of the LNCC window where nothing else is asked for. In 2D finer levels made the
-# map worse (brain slices, tissue sections): one part fits in every detail, and the rest, which bends, goes with it.
-_NODES = {2: 20_000, 3: 150_000}
-_WINDOW = {2: 7, 3: 5}
 
 # Voxels around a mask that belong to the picture.
 _MARGIN = 4
@@ -45,53 +38,6 @@ _SAME_SIZE = 1.05
 # An overlap, and changes of length, that are worth a warning.
 _LITTLE_OVERLAP = 0.5
 _LENGTHS = (0.5, 2.0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class AlignmentSettings:
-    """How images are aligned.
-
-    Args:
-        similarity: name, or names with weights, as in `RegistrationSettings`. ``lncc`` alone is `DetailCorrelation`,
-            which also finds maps between many different contrasts; ``nmi`` is for those it does not. ``mind`` suits
-            tissue sections that turn little.
-        window: width of the LNCC window in voxels of each level, odd; 7 in 2D and 5 in 3D when None.
-        rotations: try rotations all around, and mirror images, at the coarsest level; otherwise only the files'
-            geometry and the centres are starts, which finds rotations up to some 30°.
-        nodes: nodes of the finest level at most, 20 000 in 2D and 150 000 in 3D when None. More take longer, and are
-            better only where one affine map fits everything.
-        min_overlap: share of the smaller image (or mask) that must lie in the other one.
-        steps: evaluations of the similarity at most on each level.
-
-    Raises:
-        InputError: a value out of range, named.
-    """
-
-    similarity: str | Mapping[str, float] = "lncc"
-    window: int | None = None
-    rotations: bool = True
-    nodes: int | None = None
-    min_overlap: float = 0.3
-    steps: int = 40
-
-    def __post_init__(self) -> None:
-        similarity_weights(self.similarity)
-        if self.window is not None and (self.window < 3 or self.window % 2 == 0):
-            raise InputError(f"window must be an odd number of voxels, at least 3, got {self.window}")
-        if not 0 < self.min_overlap <= 1:
-            raise InputError(f"min_overlap must lie between 0 and 1, got {self.min_overlap}")
-        if self.nodes is not None and self.nodes < _COARSEST:
-            raise InputError(f"nodes must be at least {_COARSEST}, got {self.nodes}")
-        if self.steps < 1:
-            raise InputError(f"steps must be at least 1, got {self.steps}")
-
-    def window_in(self, dim: int) -> int:
-        """Return the width of the window for images of ``dim`` axes."""
-        return self.window or _WINDOW[dim]
-
-    def nodes_in(self, dim: int) -> int:
-        """Return the nodes of the finest level at most for images of ``dim`` axes."""
-        return self.nodes or _NODES[dim]
 
 
 @dataclass(frozen=True)
@@ -121,7 +67,7 @@ class Alignment:
 def align(
     fixed: Image,
     moving: Image,
-    kind: str = "affine",
+    kind: str | None = None,
     *,
     fixed_mask: Image | None = None,
     moving_mask: Image | None = None,
@@ -132,7 +78,7 @@ def align(
     Args:
         fixed: image that stays, grey or colour.
         moving: image to be aligned with it; another grid, direction or spacing does not matter.
-        kind: ``none``, ``translation``, ``rigid`` (rotation and shift), ``similarity`` (and one scale) or ``affine``.
+        kind: as in `AlignmentSettings`; that of the settings when None.
         fixed_mask: where the fixed image counts, not 0; anywhere in the world.
         moving_mask: the same for the moving image.
         settings: defaults when None.
@@ -150,9 +96,10 @@ def align(
         climbed by BFGS on the group of maps, coarse to fine; the files' geometry competes again on the second level,
         and is kept at the end if nothing is more similar. The map depends on the world positions of the voxels, not
         on the order of the axes in the file. Determinants are positive: maps grow from rotations by exponentials.
-        Runs on the images' device, in float32; not differentiable, see `affine_warp`.
+        Runs on the images' device, in float32; not differentiable.
     """
     settings, began = settings or AlignmentSettings(), perf_counter()
+    kind = settings.kind if kind is None else kind
     require_choice(kind, ALIGNMENTS, "align: kind")
     pair = _prepared((fixed, fixed_mask), (moving, moving_mask), settings)
     frame = Frame.of(pair[0].image)
@@ -177,29 +124,6 @@ def align(
         perf_counter() - began,
         _warnings(levels[-1], best, found, (fixed.name, moving.name)),
     )
-
-
-def affine_warp(
-    moving: Image, fixed: Image, affine: Affine, *, mode: str = "linear", outside: float | None = 0.0
-) -> Tensor:
-    """Return moving(M x + t) at the nodes x of ``fixed``.
-
-    Args:
-        moving: the image to sample.
-        fixed: the image whose grid is wanted.
-        affine: fixed world -> moving world.
-        mode: ``linear`` or ``nearest``.
-        outside: value outside the moving image; None continues its edge.
-
-    Returns:
-        ``(1, C, *S)`` on the fixed grid.
-
-    Notes:
-        Differentiable in M, t and the moving pixels. Coordinates are computed in float64.
-    """
-    points = fixed.grid.points(dtype=torch.float64, device=moving.data.device)
-    there = moving.to_grid(affine(fixed.to_world(points)))
-    return sample(moving.data, there, moving.grid, mode=mode, outside=outside)
 
 
 def _descend(levels: list[Level], candidates: list[Candidate], kind: str, settings: AlignmentSettings) -> Candidate:
@@ -256,15 +180,22 @@ def _prepared(
     if fixed[0].grid.dim != moving[0].grid.dim:
         kinds = f"{fixed[0].name} is {fixed[0].grid.dim}D but {moving[0].name} is {moving[0].grid.dim}D"
         raise InputError(f"{kinds}; give two images of the same dimension")
-    pair = [_weighted(luminance(image), mask).cropped(_MARGIN) for image, mask in (fixed, moving)]
-    ranges = [_range(part) for part in pair]
-    if needs_common_scale(settings.similarity):
-        ranges = [(min(r[0] for r in ranges), max(r[1] for r in ranges))] * len(pair)
-    first, second = (_scaled(part, *r) for part, r in zip(pair, ranges, strict=True))
+    pair = [_masked(luminance(image), mask).cropped(_MARGIN) for image, mask in (fixed, moving)]
+    scaled = to_common_scale(
+        (pair[0].image.data, pair[1].image.data),
+        (pair[0].weight, pair[1].weight),
+        jointly=needs_common_scale(settings.similarity),
+    )
+    first, second = (_filled(part.with_data(data.clamp(0, 1).float())) for part, data in zip(pair, scaled, strict=True))
     return first, second
 
 
-def _weighted(image: Image, mask: Image | None) -> Masked:
+def _filled(part: Masked) -> Masked:
+    """Return the image with new values where it has no weight: smoothing would spread the old ones."""
+    return part if part.weight is None else part.with_data(fill(part.image.data, part.weight))
+
+
+def _masked(image: Image, mask: Image | None) -> Masked:
     require_registrable(image)
     if mask is None:
         return Masked(image)
@@ -274,22 +205,6 @@ def _weighted(image: Image, mask: Image | None) -> Masked:
     if not bool(inside.any()):
         raise InputError(f"{mask.name} marks no voxel of {image.name}; check that it is the right mask")
     return Masked(image, inside.to(image.data))
-
-
-def _range(part: Masked) -> tuple[float, float]:
-    """Return the 0.5 and 99.5 percentiles of what counts, or its extremes where these are equal."""
-    values = part.image.data if part.weight is None else part.image.data[part.weight > 0]
-    values = values.flatten()
-    values = values[:: max(1, len(values) // 2**18)]
-    low, high = (values.kthvalue(1 + round(share * (len(values) - 1))).values for share in (0.005, 0.995))
-    if high <= low:
-        low, high = part.image.data.min(), part.image.data.max()
-    return float(low), float(high)
-
-
-def _scaled(part: Masked, low: float, high: float) -> Masked:
-    data = ((part.image.data - low) / (high - low)).clamp(0, 1)
-    return replace(part, image=replace(part.image, data=data.float())).filled()
 
 
 def _levels(fixed: Masked, moving: Masked, frame: Frame, settings: AlignmentSettings, size: float = 1.0) -> list[Level]:
@@ -306,13 +221,13 @@ def _levels(fixed: Masked, moving: Masked, frame: Frame, settings: AlignmentSett
         levels.insert(0, _level(fixed, moving, frame, settings))
         voxel *= 2
         shape = fixed.image.grid.shape
-        if math.prod(shape) <= _COARSEST or with_voxels(fixed.image.grid, voxel).shape == shape:
+        if math.prod(shape) <= COARSEST_NODES or with_voxels(fixed.image.grid, voxel).shape == shape:
             return levels
 
 
 def _level(fixed: Masked, moving: Masked, frame: Frame, settings: AlignmentSettings) -> Level:
     def compared(part: Masked) -> Masked:
-        return replace(part, image=replace(part.image, data=features(settings.similarity, part.image.data)))
+        return part.with_data(features(settings.similarity, part.image.data))
 
     def make(image: Tensor, grid: Grid) -> Similarity:
         if similarity_weights(settings.similarity).keys() == {"lncc"}:

@@ -2,24 +2,20 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import product
 
 import torch
 from torch import Tensor
 
 from torchdeform.core.derivatives import derivative
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image
-from torchdeform.core.resampling import box_sum, restrict, with_voxels
+from torchdeform.core.image import Image, box_corners
+from torchdeform.core.resampling import restrict, with_voxels
 from torchdeform.core.warp import sample
 from torchdeform.metrics.similarity import Similarity
 from torchdeform.registration.affine.lie import homogeneous
 
 # Weight of plain displacement in the metric, so that flat images have one too.
 _DAMPING = 1e-3
-
-# Width in voxels from which painted-over voxels take their values, odd.
-_BRUSH = 5
 
 # Numbers that a batch of maps may hold at once.
 _CHUNK = 2**21
@@ -44,16 +40,9 @@ class Masked:
         weight = None if self.weight is None else restrict(self.weight, grid, coarse)
         return Masked(replace(self.image, data=restrict(self.image.data, grid, coarse), grid=coarse), weight)
 
-    def filled(self) -> "Masked":
-        """Return the image with what has no weight painted over by its neighbours: smoothing would spread it."""
-        if self.weight is None:
-            return self
-        data, known = self.image.data, (self.weight > 0).to(self.image.data)
-        count = box_sum(known, _BRUSH)
-        near = box_sum(data * known, _BRUSH) / count.clamp(min=1)
-        mean = (data * known).sum() / known.sum() / data.shape[1]
-        paint = torch.where(count > 0, near, mean)
-        return replace(self, image=replace(self.image, data=torch.where(known > 0, data, paint)))
+    def with_data(self, data: Tensor) -> "Masked":
+        """Return the image with other values ``(1, C, *S)``."""
+        return replace(self, image=replace(self.image, data=data))
 
     def cropped(self, margin: int) -> "Masked":
         """Return the box around all voxels with a weight, ``margin`` voxels wider; the whole without weights."""
@@ -80,7 +69,7 @@ class Frame:
     @classmethod
     def of(cls, image: Image) -> "Frame":
         """Return the frame in which the image's box has its centre at 0 and its corners at distance 1."""
-        corners = _corners(image)[0]
+        corners = image.to_world(box_corners(image.grid))[0]
         return cls(corners.mean(1), float((corners[:, -1] - corners[:, 0]).norm()) / 2)
 
     def from_world(self, points: Tensor) -> Tensor:
@@ -125,7 +114,7 @@ class Level:
         self.voxel = grid.cell_volume ** (1 / grid.dim) / frame.radius
         self._place = frame.to_grid(moving.image)
         self._channels = _with_slopes(moving)
-        self._ends = _with_ones(frame.from_world(_corners(fixed.image))[0])
+        self._ends = _with_ones(frame.from_world(fixed.image.to_world(box_corners(grid)))[0])
         self._make, self._made = make, {}
 
     @property
@@ -212,9 +201,3 @@ def _with_slopes(moving: Masked) -> Tensor:
 
 def _with_ones(points: Tensor) -> Tensor:
     return torch.cat([points, torch.ones_like(points[:1])])
-
-
-def _corners(image: Image) -> Tensor:
-    """Return the corners of the image's box ``(1, D, 2^D)`` in the world, opposite ones first and last."""
-    ends = torch.tensor(list(product(*((0.0, side) for side in image.grid.extent))), dtype=torch.float64)
-    return image.to_world(ends.T.unsqueeze(0))

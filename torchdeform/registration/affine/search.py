@@ -8,9 +8,28 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.grid import threads_worth
+from torchdeform.core.image import background, centre_of_mass
 from torchdeform.registration.affine.bfgs import climb
 from torchdeform.registration.affine.lie import angle, generators, homogeneous, rotations
 from torchdeform.registration.affine.objective import Frame, Level, Masked
+
+# Starts that are optimised, mirrored ones among them, and those that go on to the next level.
+_OPTIMISED, _MIRRORED, _KEPT = 10, 3, 3
+
+# Maps nearer to each other than this (norm of the difference of their matrices) count as one.
+_SAME_START, _SAME_END = 0.3, 0.05
+
+# Voxels of the coarsest level within which a maximum is found here; it is optimised again.
+_NEAR = 0.05
+
+# A map that turns further than this many degrees has to be better than the others by this share.
+_TURNED, _TURNED_GAIN = 45.0, 1.1
+
+# A mirror image has to be better by this share before it is mentioned.
+_MIRROR_GAIN = 1.2
+
+# A ratio of sizes nearer to 1 than this is no reason to start with another scale.
+_SAME_SIZE = 1.1
 
 
 @dataclass(frozen=True)
@@ -26,38 +45,6 @@ class Start:
     name: str
     map: Tensor
     turned: bool
-
-
-# Starts that are climbed, mirrored ones among them, and those that go on to the next level.
-_CLIMBED = 10
-
-
-_MIRRORED = 3
-
-
-_KEPT = 3
-
-
-# Maps nearer to each other than this (norm of the difference of their matrices) count as one.
-_SAME_START = 0.3
-
-
-_SAME_END = 0.05
-
-
-# Voxels of the coarsest level within which a summit is found here; it is climbed again.
-_NEAR = 0.05
-
-
-# A map that turns further than this many degrees has to be better than the others by this share.
-_TURNED = 45.0
-
-
-_TURNED_GAIN = 1.1
-
-
-# A mirror image has to be better by this share before it is mentioned.
-_MIRROR_GAIN = 1.2
 
 
 @dataclass(frozen=True)
@@ -129,7 +116,7 @@ def search(level: Level, kind: str, *, turn: bool, steps: int) -> Found:
     """
     rough = "similarity" if kind == "affine" else kind
     bodies = body(level.fixed, level.frame), body(level.moving, level.frame)
-    plain, chance = _try(level, make_starts(*bodies, turn=turn, scale=rough == "similarity"), rough, steps, _CLIMBED)
+    plain, chance = _try(level, make_starts(*bodies, turn=turn, scale=rough == "similarity"), rough, steps, _OPTIMISED)
     if not turn or not plain:
         return Found(_best(plain, chance))
     flipped = make_starts(*bodies, turn=True, scale=rough == "similarity", mirror=True)
@@ -179,10 +166,6 @@ def _best(candidates: list[Candidate], chance: float) -> list[Candidate]:
     return kept
 
 
-# A ratio of sizes nearer to 1 than this is no reason to start with another scale.
-_SAME_SIZE = 1.1
-
-
 @dataclass(frozen=True)
 class Body:
     """Where an image's content lies in the frame.
@@ -206,19 +189,14 @@ def body(part: Masked, frame: Frame) -> Body:
         frame: coordinates of the result.
     """
     grid = part.image.grid
-    weight = _foreground(part.image.data) if part.weight is None else part.weight
-    weight = weight.double().flatten().cpu()
-    weight = weight / weight.sum()
+    data = part.image.data
+    weight = (data - background(data)).abs().mean(1, keepdim=True) + 1e-6 if part.weight is None else part.weight
+    weight = weight.double().cpu()
+    mass = frame.from_world(centre_of_mass(part.image, weight).unsqueeze(2))[0]
     points = frame.from_world(part.image.to_world(grid.points(dtype=torch.float64)).flatten(2))[0]
-    mass = points @ weight
-    away = points - mass.unsqueeze(1)
-    return Body(mass, (away * weight) @ away.T, (points[:, 0] + points[:, -1]) / 2)
-
-
-def _foreground(data: Tensor) -> Tensor:
-    axes = range(2, data.dim())
-    faces = torch.cat([data.select(a, end).flatten(1) for a, end in itertools.product(axes, (0, -1))], dim=1)
-    return (data - faces.median()).abs().mean(dim=1) + 1e-6
+    away = points - mass
+    covariance = (away * (weight / weight.sum()).flatten()) @ away.T
+    return Body(mass.squeeze(1), covariance, (points[:, 0] + points[:, -1]) / 2)
 
 
 def make_starts(fixed: Body, moving: Body, *, turn: bool, scale: bool, mirror: bool = False) -> list[Start]:
