@@ -43,7 +43,8 @@ from .io import (
 )
 from .metrics.evaluation import Evaluation, Measures, dice, hausdorff
 from .pipeline.config import load_settings
-from .registration.affine.align import Alignment, AlignmentSettings, align
+from .registration.affine.align import Alignment, align
+from .registration.affine.settings import AlignmentSettings
 from .registration.deformable import register
 from .registration.discrete import DiscreteSettings, discrete_start
 from .registration.problem import Guidance

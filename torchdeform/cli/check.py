@@ -12,7 +12,7 @@ from torchdeform.errors import InputError, require_choice
 from torchdeform.io import read_image
 from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.pipeline.preflight import ERROR, Finding, is_oblique, orientation, preflight
-from torchdeform.registration.settings import ALIGNMENTS
+from torchdeform.registration.affine.settings import ALIGNMENTS
 from torchdeform.report.figures import write_overlay
 
 Fixed = Annotated[

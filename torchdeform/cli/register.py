@@ -25,8 +25,8 @@ from torchdeform.metrics.similarity import similarity_weights
 from torchdeform.pipeline.config import load_settings, parse_override, preset_names
 from torchdeform.pipeline.memory import parse_size
 from torchdeform.pipeline.register import REPORT, Outcome, PairFiles, register_files
+from torchdeform.registration.affine.settings import ALIGNMENTS
 from torchdeform.registration.result import Progress as Step
-from torchdeform.registration.settings import ALIGNMENTS
 
 Fixed = Annotated[
     Path,

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from torchdeform.errors import InputError, require_choice
 from torchdeform.metrics.similarity import similarity_weights
+from torchdeform.registration.affine.settings import ALIGNMENTS
 
-ALIGNMENTS = ("none", "translation", "rigid", "similarity", "affine")
 STARTS = ("identity", "discrete")
 
 
