@@ -1,4 +1,4 @@
-"""One report_data of the world in two images on different grids, with the affine map between them."""
+"""One scene of the world in two images on different grids, with the affine map between them."""
 
 import math
 from dataclasses import replace
@@ -9,9 +9,9 @@ from torch import Tensor
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine
-from torchdeform.metrics.correlation import DetailCorrelation
+from torchdeform.metrics.correlation import ForegroundLNCC
 from torchdeform.metrics.similarity import make_similarity
-from torchdeform.registration.affine.objective import Frame, Level, Masked
+from torchdeform.registration.affine.objective import AffineObjective, MaskedImage, NormalisedFrame
 
 TILTED = {
     2: ((math.cos(0.4), -math.sin(0.4)), (math.sin(0.4), math.cos(0.4))),
@@ -30,7 +30,7 @@ SPACINGS = {2: ((1.4, 1.2), (1.2, 1.3)), 3: ((2.0, 1.6, 1.4), (1.6, 1.7, 1.5))}
 SIDES = (60.0, 44.0, 36.0)
 
 
-def report_data(world: Tensor, count: int = 14) -> Tensor:
+def scene(world: Tensor, count: int = 14) -> Tensor:
     """A value for every world point: blobs of different width and height near the origin, no two places alike."""
     random = torch.Generator().manual_seed(0)
     dim = world.shape[1]
@@ -54,9 +54,9 @@ def empty(shape, spacing, *, centre=None, tilted=False) -> Image:
 
 
 def picture(place: Image, through: Affine | None = None) -> Image:
-    """The report_data on the grid of ``place``, each world point being taken through a map first."""
+    """The scene on the grid of ``place``, each world point being taken through a map first."""
     world = place.to_world(place.grid.points(dtype=torch.float64))
-    return replace(place, data=report_data(world if through is None else through(world)).float())
+    return replace(place, data=scene(world if through is None else through(world)).float())
 
 
 def make_pair(true: Affine, *, follow: bool = False, finer: float = 1.0) -> tuple[Image, Image]:
@@ -86,14 +86,14 @@ def distance(found: Affine, true: Affine, fixed: Image) -> float:
     return float((found(world) - true(world)).norm(dim=1).mean()) / min(fixed.grid.spacing)
 
 
-def make_level(dim: int, similarity: str = "ncc") -> Level:
+def make_objective(dim: int, similarity: str = "ncc") -> AffineObjective:
     fixed, moving = make_pair(make_true(turn(dim, 10)))
     weight = torch.rand(fixed.data.shape, generator=torch.Generator().manual_seed(1))
     parts = (
-        Masked(replace(fixed, data=fixed.data.double() / 200), weight.double()),
-        Masked(replace(moving, data=moving.data.double() / 200)),
+        MaskedImage(replace(fixed, data=fixed.data.double() / 200), weight.double()),
+        MaskedImage(replace(moving, data=moving.data.double() / 200)),
     )
-    make = {"detail": lambda f, grid: DetailCorrelation(f, 5)}.get(
+    make = {"detail": lambda f, grid: ForegroundLNCC(f, 5)}.get(
         similarity, lambda f, grid: make_similarity(similarity, f, 5, grid=grid)
     )
-    return Level(*parts, Frame.of(fixed), make, 0.1)
+    return AffineObjective(*parts, NormalisedFrame.of(fixed), make, 0.1)

@@ -20,7 +20,7 @@ from torchdeform.pipeline.citations import citations
 from torchdeform.pipeline.config import load_settings
 from torchdeform.pipeline.memory import footprint
 from torchdeform.pipeline.register import PairFiles
-from torchdeform.registration.affine.align import AlignmentSettings
+from torchdeform.registration.affine.settings import AlignmentSettings
 from torchdeform.registration.deformable import register
 from torchdeform.registration.settings import RegistrationSettings
 

@@ -129,7 +129,7 @@ def register(
     if json:
         print_json({**outcome.record, "out": str(outcome.folder)})
     elif not quiet:
-        for warning in outcome.warnings:
+        for warning in outcome.record["warnings"]:
             typer.echo(f"warning: {warning}", err=True)
         typer.echo(summary(outcome))
 
@@ -142,8 +142,8 @@ def summary(outcome: Outcome) -> str:
         "folds": f"{r['folds']}, determinant {r['determinant_min']:.3g} to {r['determinant_max']:.3g}",
         "inverse error": f"{r['inverse_error_mean']:.2g} voxel on average, {r['inverse_error_max']:.2g} at most",
         **_measured(r),
-        "seconds": f"{sum(outcome.seconds.values()):.1f} on {r['device']}",
-        "results": f"{outcome.folder}{os.sep} ({', '.join(outcome.files)})",
+        "seconds": f"{sum(r['seconds'].values()):.1f} on {r['device']}",
+        "results": f"{outcome.folder}{os.sep} ({', '.join(r['files'])})",
         "look at": str(outcome.folder / REPORT),
     }
     return table(lines)

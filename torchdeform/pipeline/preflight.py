@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image, overlap, require_same_place, resample
-from torchdeform.core.intensities import corresponding_channels
+from torchdeform.core.image import Image, background, centre_of_mass, overlap, require_same_place, resample
+from torchdeform.core.intensities import corresponding_channels, intensity_range
 from torchdeform.core.resampling import MIN_NODES
 from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
 from torchdeform.metrics.similarity import needs_common_scale
 from torchdeform.pipeline.memory import available, footprint, readable
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.report.report_data import quantiles
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 
@@ -216,19 +215,14 @@ def _check_overlap(fixed: Image, moving: Image, aligned: bool) -> Iterator[Findi
 
 
 def _check_scale(fixed: Image, moving: Image, settings: RegistrationSettings) -> Iterator[Finding]:
-    ranges = [_range(image) for image in (fixed, moving)]
+    ends = (intensity_range(image.data.flatten()[None], low=0.01, high=0.99) for image in (fixed, moving))
+    ranges = [float(high - low) for low, high in ends]
     if max(ranges) / max(min(ranges), 1e-30) > _SCALE_RATIO:
         text = f"{fixed.name} spans {ranges[0]:.4g} grey values and {moving.name} {ranges[1]:.4g}"
         if needs_common_scale(settings.similarity.measure):
             yield Finding(WARNING, f"{text}; scale them alike, or use another similarity than ssd")
         else:
             yield Finding(NOTE, f"{text}; scale them alike if they are of one kind and you compare them by ssd")
-
-
-def _range(image: Image) -> float:
-    """Return the distance of the 1st and 99th percentile, or of the extremes if those are equal."""
-    low, high, lowest, highest = quantiles(image.data, 1, 99, 0, 100)
-    return high - low or highest - lowest
 
 
 def _check_channels(fixed: Image, moving: Image) -> Iterator[Finding]:
@@ -323,9 +317,10 @@ def flip_correlations(fixed: Image, moving: Image) -> dict[tuple[float, ...], fl
     """
     one, other = _coarse(fixed), _coarse(moving)
     points = one.grid.points(dtype=torch.float64, device=one.data.device)
-    world = one.to_world(points) - _centre(one)
+    here, there = (centre_of_mass(some, some.data.abs()).view(1, -1, *[1] * some.grid.dim) for some in (one, other))
+    world = one.to_world(points) - here
     return {
-        signs: _correlation(one.data, _at(other, world * one.grid.along(signs, world) + _centre(other)))
+        signs: _correlation(one.data, _at(other, world * one.grid.along(signs, world) + there))
         for signs in product((1.0, -1.0), repeat=fixed.grid.dim)
     }
 
@@ -340,16 +335,7 @@ def _coarse(image: Image) -> Image:
     first = [h * (block - 1) / 2 for h, block in zip(image.grid.spacing, blocks, strict=True)]
     origin = image.to_world(torch.tensor(first, dtype=torch.float64).view(1, -1, 1)).flatten().tolist()
     spacing = tuple(h * block for h, block in zip(image.grid.spacing, blocks, strict=True))
-    faces = torch.cat([grey.select(axis, end).flatten() for axis in image.grid.axes for end in (0, -1)])
-    return replace(image, data=grey - faces.median(), grid=Grid(tuple(grey.shape[2:]), spacing), origin=tuple(origin))
-
-
-def _centre(image: Image) -> Tensor:
-    """Return the centre of mass ``(1, D, 1, ..)`` of what differs from the background, in world mm."""
-    world = image.to_world(image.grid.points(dtype=torch.float64, device=image.data.device))
-    weight = image.data.abs().double()
-    mass = weight.sum().clamp(min=torch.finfo(torch.float64).tiny)
-    return (world * weight).sum(image.grid.axes, keepdim=True) / mass
+    return replace(image, data=grey - background(grey), grid=Grid(tuple(grey.shape[2:]), spacing), origin=tuple(origin))
 
 
 def _at(image: Image, world: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Settings of an alignment."""
+"""Settings of the alignment that comes before a registration."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from torchdeform.metrics.similarity import similarity_weights
 
 ALIGNMENTS = ("none", "translation", "rigid", "similarity", "affine")
 
-# Nodes of the coarsest level at most, where all starts are tried.
+# Nodes of the coarsest level at most, on which all starts are tried.
 COARSEST_NODES = 4096
 
 # Nodes of the finest level and width of the LNCC window where nothing else is asked for. In 2D finer levels made the
@@ -23,9 +23,9 @@ class AlignmentSettings:
 
     Args:
         kind: ``none``, ``translation``, ``rigid`` (rotation and shift), ``similarity`` (and one scale) or ``affine``.
-        similarity: name, or names with weights, as in `RegistrationSettings`. ``lncc`` alone is `DetailCorrelation`,
-            which also finds maps between many different contrasts; ``nmi`` is for those it does not. ``mind`` suits
-            tissue sections that turn little.
+        similarity: name, or names with weights, as in `RegistrationSettings`. ``lncc`` alone is `ForegroundLNCC`, which
+            also finds maps between many different contrasts; ``nmi`` is for those it does not. ``mind`` suits tissue
+            sections that turn little.
         window: width of the LNCC window in voxels of each level, odd; 7 in 2D and 5 in 3D when None.
         rotations: try rotations all around, and mirror images, at the coarsest level; otherwise only the files'
             geometry and the centres are starts, which finds rotations up to some 30°.
@@ -49,7 +49,7 @@ class AlignmentSettings:
     def __post_init__(self) -> None:
         require_choice(self.kind, ALIGNMENTS, "align.kind")
         similarity_weights(self.similarity)
-        if not isinstance(self.similarity, str):
+        if not isinstance(self.similarity, str):  # a copy of our own, and a dict, which `asdict` can take
             object.__setattr__(self, "similarity", dict(self.similarity))
         if self.window is not None and (self.window < 3 or self.window % 2 == 0):
             raise InputError(f"align.window must be an odd number of voxels, at least 3, got {self.window}")
