@@ -9,7 +9,7 @@ from torch import Tensor
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine
-from torchdeform.metrics.correlation import DetailCorrelation
+from torchdeform.metrics.correlation import ForegroundLNCC
 from torchdeform.metrics.similarity import make_similarity
 from torchdeform.registration.affine.objective import AffineObjective, MaskedImage, NormalisedFrame
 
@@ -93,7 +93,7 @@ def make_objective(dim: int, similarity: str = "ncc") -> AffineObjective:
         MaskedImage(replace(fixed, data=fixed.data.double() / 200), weight.double()),
         MaskedImage(replace(moving, data=moving.data.double() / 200)),
     )
-    make = {"detail": lambda f, grid: DetailCorrelation(f, 5)}.get(
+    make = {"detail": lambda f, grid: ForegroundLNCC(f, 5)}.get(
         similarity, lambda f, grid: make_similarity(similarity, f, 5, grid=grid)
     )
     return AffineObjective(*parts, NormalisedFrame.of(fixed), make, 0.1)

@@ -13,7 +13,7 @@ from torchdeform.core.intensities import fill, to_common_scale
 from torchdeform.core.resampling import with_voxels
 from torchdeform.core.transform import Affine
 from torchdeform.errors import ComputationError, InputError, require_choice
-from torchdeform.metrics.correlation import DetailCorrelation
+from torchdeform.metrics.correlation import ForegroundLNCC
 from torchdeform.metrics.similarity import Similarity, features, make_similarity, needs_common_scale, similarity_weights
 from torchdeform.registration.affine.lie import generators
 from torchdeform.registration.affine.objective import AffineObjective, MaskedImage, NormalisedFrame
@@ -237,7 +237,7 @@ def _make_objective(
 
     def make(image: Tensor, grid: Grid) -> Similarity:
         if similarity_weights(settings.similarity).keys() == {"lncc"}:
-            return DetailCorrelation(image, settings.window_in(grid.dim))
+            return ForegroundLNCC(image, settings.window_in(grid.dim))
         return make_similarity(settings.similarity, image, settings.window_in(grid.dim), grid=grid)
 
     return AffineObjective(compared(fixed), compared(moving), frame, make, settings.min_overlap)
