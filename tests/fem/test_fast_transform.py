@@ -208,7 +208,12 @@ def test_poisson_inverts_the_laplacian(grid):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: FastTransform().init(DivCurlSystem(Grid((4, 4)), Weights(torch.rand(1, 1, 3, 3) + 1)), torch.zeros(1)), "transform is not exact"),
+        (
+            lambda: FastTransform().init(
+                DivCurlSystem(Grid((4, 4)), Weights(torch.rand(1, 1, 3, 3) + 1)), torch.zeros(1)
+            ),
+            "transform is not exact",
+        ),
         (lambda: transform(Grid((4, 4)), Weights(), "slid"), "did you mean 'slip'"),
         (lambda: transform(Grid((4, 4)), Weights())(torch.zeros(1, 3, 4, 4)), "load must have shape"),
         (
