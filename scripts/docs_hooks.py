@@ -1,4 +1,4 @@
-"""What mkdocs does beside its plugins: links to files of the project outside docs, and the help texts of the shell.
+"""Two additions to mkdocs: links to files of the project outside docs, and the help texts of the shell.
 
 `on_page_markdown` is called by mkdocs for each page, see ``hooks`` in mkdocs.yml.
 """
