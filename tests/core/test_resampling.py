@@ -16,17 +16,17 @@ from torchdeform.core.resampling import (
     MIN_NODES,
     Transfer,
     banded,
-    box_spread,
     box_sum,
+    box_sum_transpose,
     centres,
-    gathering,
+    coarsened,
     interpolation,
+    interpolation_transpose,
     multiply,
     prolong,
     pyramid_grids,
     restrict,
     restriction,
-    thinned,
 )
 
 LIKE = torch.zeros(0, dtype=torch.float64)
@@ -67,7 +67,7 @@ def test_interpolation_and_its_transpose(coarse, fine):
     up = applied(interpolation(coarse, fine, LIKE), field)
     torch.testing.assert_close(up, F.interpolate(field, fine, mode="linear", align_corners=True).flatten())
     force = torch.rand(fine, dtype=torch.float64)
-    down = applied(gathering(fine, coarse, LIKE), force)
+    down = applied(interpolation_transpose(fine, coarse, LIKE), force)
     torch.testing.assert_close((field.flatten() * down).sum(), (up * force).sum() * (coarse - 1) / (fine - 1))
     assert interpolation(coarse, coarse, LIKE) is None
 
@@ -115,7 +115,7 @@ def test_with_a_stride_windows_are_left_out_and_the_transpose_is_one(shape, wind
     few = box_sum(x, window, stride)
     torch.testing.assert_close(few, centres(box_sum(x, window), stride))
     y = torch.rand(few.shape, generator=generator, dtype=torch.float64)
-    torch.testing.assert_close((few * y).sum(), (x * box_spread(y, window, stride, tuple(shape))).sum())
+    torch.testing.assert_close((few * y).sum(), (x * box_sum_transpose(y, window, stride, tuple(shape))).sum())
 
 
 @settings(max_examples=50, deadline=None)
@@ -163,7 +163,7 @@ MODES = {2: "bilinear", 3: "trilinear"}
 @pytest.fixture(params=[(41, 36), (30, 20, 25), (12, 600)], ids=["2d", "3d", "long"])
 def transfer(request):
     fine = Grid(request.param, spacing=(1.0, 0.7, 1.3)[: len(request.param)])
-    return Transfer(fine, thinned(fine, 2.0), torch.zeros(1, dtype=torch.float64))
+    return Transfer(fine, coarsened(fine, 2.0), torch.zeros(1, dtype=torch.float64))
 
 
 def test_up_is_linear_interpolation(transfer):

@@ -98,7 +98,7 @@ def interpolation(coarse: int, fine: int, like: Tensor) -> Banded | None:
     return None if coarse == fine else banded(*_linear(coarse, fine), (fine, coarse), like)
 
 
-def gathering(fine: int, coarse: int, like: Tensor) -> Banded | None:
+def interpolation_transpose(fine: int, coarse: int, like: Tensor) -> Banded | None:
     """Return the transpose of `interpolation`, divided by the number of fine intervals to a coarse one."""
     rows, columns, values = _linear(coarse, fine)
     return None if coarse == fine else banded(columns, rows, values * ((coarse - 1) / (fine - 1)), (coarse, fine), like)
@@ -174,7 +174,7 @@ def box_sum(x: Tensor, window: int, stride: int = 1) -> Tensor:
     return x
 
 
-def box_spread(y: Tensor, window: int, stride: int, shape: tuple[int, ...]) -> Tensor:
+def box_sum_transpose(y: Tensor, window: int, stride: int, shape: tuple[int, ...]) -> Tensor:
     """Return at each node Σ y over the windows that hold it: the transpose of `box_sum` on ``shape``.
 
     Args:
@@ -248,7 +248,7 @@ class Transfer:
 
     @cached_property
     def _downs(self) -> list[Banded | None]:
-        return [gathering(many, few, self.like) for many, few in self._counts]
+        return [interpolation_transpose(many, few, self.like) for many, few in self._counts]
 
     @property
     def _counts(self) -> list[tuple[int, int]]:
@@ -281,18 +281,18 @@ def pyramid_grids(grid: Grid, levels: int) -> list[Grid]:
     """
     grids = [grid]
     for level in range(1, levels):
-        coarser = thinned(grid, 2**level)
+        coarser = coarsened(grid, 2**level)
         if coarser.shape != grids[0].shape and max(coarser.shape) >= _MIN_LONGEST:
             grids.insert(0, coarser)
     return grids
 
 
-def thinned(grid: Grid, times: float) -> Grid:
+def coarsened(grid: Grid, times: float) -> Grid:
     """Return the grid of the same box whose voxels are about so many times as wide as the narrowest of ``grid``."""
-    return with_voxels(grid, min(grid.spacing) * times)
+    return with_spacing(grid, min(grid.spacing) * times)
 
 
-def with_voxels(grid: Grid, width: float) -> Grid:
+def with_spacing(grid: Grid, width: float) -> Grid:
     """Return the grid of the same box with voxels of about this width, at least 8 nodes an axis where there are."""
     shape = tuple(
         n if h >= width else min(n, max(MIN_NODES, round(side / width) + 1))

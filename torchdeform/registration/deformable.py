@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchdeform.core.diagnostics import Diagnosis, diagnose, inverse_error, smallest_determinant
 from torchdeform.core.fold_free import mended
-from torchdeform.core.grid import Grid, threads_worth
+from torchdeform.core.grid import Grid, limit_threads
 from torchdeform.core.image import Image, resample
 from torchdeform.core.resampling import MIN_NODES, prolong
 from torchdeform.core.transform import Affine
@@ -95,7 +95,7 @@ def _register_tensors(
     scene = scene.scaled(settings)
     climbed = _climb(scene, between_tensors(scene) if settings.symmetric else None, settings, start, callback)
     del scene
-    with threads_worth(len(climbed.u), grid):
+    with limit_threads(len(climbed.u), grid):
         warped = warp(moving, climbed.u, grid)
         evaluation = evaluate_tensors(climbed.u, grid, labels=guidance.labels, points=guidance.points)
     return replace(_finish(climbed, grid, warped, settings), evaluation=evaluation)
@@ -211,7 +211,7 @@ def _climb(
     else:
         u, records = climb_levels(scene, settings, start, callback)
     climbed = perf_counter()
-    with threads_worth(len(u), scene.grid):
+    with limit_threads(len(u), scene.grid):
         comparison = compare_from_fixed(scene, settings)
         before, after = comparison.look()[1], comparison.look(u)[1]
     seconds = sum(record.seconds for record in records) + perf_counter() - climbed
@@ -230,7 +230,7 @@ def _checked_start(start: Tensor, scene: Scene) -> Tensor:
 
 def _finish(climbed: _Climbed, grid: Grid, warped: Tensor, settings: RegistrationSettings) -> RegistrationResult:
     """Invert the map and judge it."""
-    with threads_worth(len(climbed.u), grid):
+    with limit_threads(len(climbed.u), grid):
         start = perf_counter()
         inverse = invert(climbed.u, grid)
         mean, largest = inverse_error(climbed.u, inverse, grid)

@@ -11,8 +11,8 @@ from torch import Tensor
 from torchdeform.core.derivatives import derivative
 from torchdeform.core.diagnostics import one_sided_determinant
 from torchdeform.core.fold_free import advance, keep, mended
-from torchdeform.core.grid import Grid, per_item, threads_worth
-from torchdeform.core.resampling import Transfer, prolong, pyramid_grids, thinned
+from torchdeform.core.grid import Grid, limit_threads, per_item
+from torchdeform.core.resampling import Transfer, coarsened, prolong, pyramid_grids
 from torchdeform.core.warp import warp
 from torchdeform.fem.fast_transform import TransformSolver
 from torchdeform.fem.form import Form, Row, Term
@@ -138,7 +138,7 @@ def climb_levels(
     u, records = u if start is None else start.to(u), []
     for index, grid in enumerate(grids):
         level = _make_level(index, len(grids) - 1 - index, scene.on(grid), settings)
-        with threads_worth(len(u), grid):
+        with limit_threads(len(u), grid):
             u, record = _climb(level, mended(prolong(u, level.grid), level.grid), len(grids), callback)
         records.append(record)
     return mended(prolong(u, scene.grid), scene.grid), tuple(records)
@@ -157,7 +157,7 @@ def steps_on(grid: Grid, steps: int, settings: RegistrationSettings) -> int:
 
 def _map_grid(grid: Grid, settings: RegistrationSettings) -> Grid:
     """Return the grid that carries the map of images on ``grid``."""
-    return thinned(grid, settings.map_spacing) if math.prod(grid.shape) > _LARGE else grid
+    return coarsened(grid, settings.map_spacing) if math.prod(grid.shape) > _LARGE else grid
 
 
 def _make_level(index: int, below: int, scene: Scene, settings: RegistrationSettings) -> _Level:
