@@ -20,6 +20,7 @@ from torchdeform.core.resampling import (
     box_sum_transpose,
     centres,
     coarsened,
+    hat_average,
     interpolation,
     interpolation_transpose,
     multiply,
@@ -70,6 +71,20 @@ def test_interpolation_and_its_transpose(coarse, fine):
     down = applied(interpolation_transpose(fine, coarse, LIKE), force)
     torch.testing.assert_close((field.flatten() * down).sum(), (up * force).sum() * (coarse - 1) / (fine - 1))
     assert interpolation(coarse, coarse, LIKE) is None
+
+
+@pytest.mark.parametrize(("fine", "coarse"), [((15, 9), (8, 9)), ((12, 33, 20), (5, 11, 20)), ((40, 301), (7, 44))])
+def test_a_hat_average_is_weighted_by_the_hat_function_of_each_node(fine, coarse):
+    """Against dense matrices; the mean of what is constant is that constant."""
+    field = expected = torch.rand(2, 3, *fine, dtype=torch.float64)
+    for axis, (many, few) in enumerate(zip(fine, coarse, strict=True), start=2):
+        place = torch.linspace(0, few - 1, many, dtype=torch.float64)
+        hats = (1 - (place - torch.arange(few).unsqueeze(1)).abs()).clamp(min=0)
+        expected = torch.einsum("ij,j...->i...", hats / hats.sum(1, keepdim=True), expected.movedim(axis, 0))
+        expected = expected.movedim(0, axis)
+    torch.testing.assert_close(hat_average(field, Grid(coarse)), expected)
+    ones = torch.ones(1, 1, *fine)
+    torch.testing.assert_close(hat_average(ones, Grid(coarse)), torch.ones(1, 1, *coarse))
 
 
 @pytest.mark.parametrize(("fine", "coarse"), [(15, 8), (97, 30), (601, 151)])

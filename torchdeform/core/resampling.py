@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 
-# Rows of a block: fewer entries of it are 0 the fewer rows it has, but small products do not pay. Two fields of 4096²
-# on half as many nodes an axis: 0.1 s, against 1.4 s when entries are taken one by one.
+# Rows of a block: with fewer rows fewer of its entries are 0, but small products are slow. Two fields of 4096² on half
+# as many nodes an axis: 0.1 s, against 1.4 s when entries are taken one by one.
 _ROWS = {"cpu": 32, "cuda": 256}
 
 # Matrices of no more entries than this are one block: a call costs more than the products with their zeros.
@@ -102,6 +102,28 @@ def interpolation_transpose(fine: int, coarse: int, like: Tensor) -> Banded | No
     """Return the transpose of `interpolation`, divided by the number of fine intervals to a coarse one."""
     rows, columns, values = _linear(coarse, fine)
     return None if coarse == fine else banded(columns, rows, values * ((coarse - 1) / (fine - 1)), (coarse, fine), like)
+
+
+def hat_average(field: Tensor, coarse: Grid) -> Tensor:
+    """Return the mean of a field ``(B, C, *S)`` around each node of a coarser grid, weighted by its hat function.
+
+    Args:
+        field: on a grid of the same box.
+        coarse: the grid of the result.
+    """
+    counts = zip(field.shape[2:], coarse.shape, strict=True)
+    return multiply(field, [_hats(many, few, field.dtype, field.device) for many, few in counts])
+
+
+@lru_cache(maxsize=64)
+def _hats(fine: int, coarse: int, dtype: torch.dtype, device: torch.device) -> Banded | None:
+    """Return the transpose of linear interpolation, every row divided by its sum."""
+    if coarse == fine:
+        return None
+    with torch.inference_mode(False), torch.no_grad():
+        columns, rows, values = _linear(coarse, fine)
+        sums = values.new_zeros(coarse).index_add_(0, rows, values)
+        return banded(rows, columns, values / sums[rows], (coarse, fine), torch.empty(0, dtype=dtype, device=device))
 
 
 def restriction(fine: int, coarse: int, blur: float, like: Tensor) -> Banded | None:
@@ -276,8 +298,8 @@ def pyramid_grids(grid: Grid, levels: int) -> list[Grid]:
         levels: number of levels wanted.
 
     Returns:
-        Grids of the same box. Each level aims at twice the voxel size of the next, starting from the finest spacing, so
-        thick slices are thinned out last. Levels with fewer than 16 nodes along every axis are left out.
+        Grids of the same box. Each level has about twice the spacing of the next, counted from the smallest spacing, so
+        thick slices are coarsened last. Levels with fewer than 16 nodes along every axis are left out.
     """
     grids = [grid]
     for level in range(1, levels):
@@ -287,15 +309,15 @@ def pyramid_grids(grid: Grid, levels: int) -> list[Grid]:
     return grids
 
 
-def coarsened(grid: Grid, times: float) -> Grid:
-    """Return the grid of the same box whose voxels are about so many times as wide as the narrowest of ``grid``."""
-    return with_spacing(grid, min(grid.spacing) * times)
+def coarsened(grid: Grid, factor: float) -> Grid:
+    """Return the grid of the same box whose spacing is about ``factor`` times the smallest one of ``grid``."""
+    return with_spacing(grid, min(grid.spacing) * factor)
 
 
-def with_spacing(grid: Grid, width: float) -> Grid:
-    """Return the grid of the same box with voxels of about this width, at least 8 nodes an axis where there are."""
+def with_spacing(grid: Grid, spacing: float) -> Grid:
+    """Return the grid of the same box with about this spacing; larger ones stay, and so do 8 nodes of an axis."""
     shape = tuple(
-        n if h >= width else min(n, max(MIN_NODES, round(side / width) + 1))
+        n if h >= spacing else min(n, max(MIN_NODES, round(side / spacing) + 1))
         for n, h, side in zip(grid.shape, grid.spacing, grid.extent, strict=True)
     )
     if shape == grid.shape:
