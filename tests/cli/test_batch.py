@@ -161,8 +161,9 @@ def test_print_config_is_a_file_that_can_be_read(tmp_path, capsys):
     assert printed.resolve() == load_settings()
 
 
-def test_only_and_mistakes_at_the_shell(touch, tmp_path, capsys):
-    touch(_IMAGES)
+def test_only_and_mistakes_at_the_shell(tmp_path, capsys):
+    for name in _IMAGES:
+        (tmp_path / name).touch()
     path = _file(tmp_path, _PATTERN)
     assert torchdeform(["batch", path, "--dry-run", "--only", "sub-a"]) == 0
     assert "1 to register" in capsys.readouterr().out

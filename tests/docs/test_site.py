@@ -76,7 +76,7 @@ def test_links_lead_somewhere(pages):
 
 def test_the_reference_has_every_public_name(pages):
     anchors = set().union(*(page.anchors for page in pages.values()))
-    names = json.loads((ROOT / "tests" / "public_names.json").read_text(encoding="utf-8"))
+    names = json.loads((ROOT / "tests" / "project" / "public_names.json").read_text(encoding="utf-8"))
     missing = [f"{module}.{name}" for module in names for name in names[module] if f"{module}.{name}" not in anchors]
     assert not missing
 

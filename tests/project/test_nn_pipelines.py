@@ -116,7 +116,7 @@ def test_moves_to_a_gpu(grid):
 _DDP = """
 import sys, torch, torch.distributed as dist
 sys.path.insert(0, sys.argv[1])
-from test_pipelines import Pipeline, pairs, GRIDS
+from test_nn_pipelines import Pipeline, pairs, GRIDS
 dist.init_process_group("gloo")
 model = torch.nn.parallel.DistributedDataParallel(Pipeline(GRIDS[0]))
 model(pairs(GRIDS[0], 2)[dist.get_rank()][None]).square().mean().backward()
@@ -132,7 +132,7 @@ def test_two_processes_find_the_gradient_of_the_whole_batch(root, tmp_path):
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
     environment = os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [*command, str(script), str(root / "tests" / "nn"), str(result)],
+        [*command, str(script), str(root / "tests" / "project"), str(result)],
         capture_output=True,
         text=True,
         check=False,

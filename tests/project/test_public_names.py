@@ -1,6 +1,6 @@
 """What is public: a committed list, and docstrings that say what goes in, what comes out and what is refused.
 
-After a change that is meant: ``python tests/test_public_names.py``.
+After a change that is meant: ``python tests/project/test_public_names.py``.
 """
 
 import ast

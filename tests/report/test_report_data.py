@@ -1,4 +1,4 @@
-"""What a report shows: slices and rates that are what the functions of the library give."""
+"""What a report shows: slices and derivatives that are what the functions of the library give."""
 
 import math
 from dataclasses import replace
@@ -13,14 +13,14 @@ from torchdeform.core.image import resample
 from torchdeform.core.transform import Affine
 from torchdeform.registration.problem import moved
 from torchdeform.report.planes import planes_of
-from torchdeform.report.report_data import grey, make_report_data, quantiles, rates, spread, to_unit
+from torchdeform.report.report_data import derivative_fields, evenly_spaced, grey, make_report_data, quantiles, to_unit
 
 
 @pytest.mark.parametrize("depth", [2, 3, 15, 16, 200])
 @pytest.mark.parametrize("count", [1, 2, 7, 15])
 def test_slices_are_spread_around_the_middle(make_image, depth, count):
     plane = planes_of(make_image((depth, 4, 5)))[0]
-    numbers = spread(plane, count)
+    numbers = evenly_spaced(plane, count)
     assert list(numbers) == sorted(set(numbers))
     assert plane.middle in numbers
     assert len(numbers) <= count
@@ -31,7 +31,7 @@ def test_slices_are_spread_around_the_middle(make_image, depth, count):
 def test_rates_are_those_of_the_stencils(shape):
     grid = Grid(shape, (0.7, 1.3, 2.0)[: len(shape)])
     u = torch.randn(1, grid.dim, *shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    found = rates(u, grid)
+    found = derivative_fields(u, grid)
     turn = curl(u, grid)
     torch.testing.assert_close(found["determinant"], jacobian_determinant(u, grid))
     torch.testing.assert_close(found["divergence"], divergence(u, grid))

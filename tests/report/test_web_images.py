@@ -18,7 +18,7 @@ def test_a_sprite_holds_the_slices_upright(make_image, make_result):
         *[make_image((20, 24, 28))] * 2, make_result(*[make_image((20, 24, 28))] * 2), slices=3
     )
     cuts = report_data.slices[1]
-    assert cuts.plane.turned == (True, False)
+    assert cuts.plane.flipped == (True, False)
     frame = frame_of(cuts.plane, 3, 200)
     pixels = np.zeros((3, *cuts.plane.shape, 1), dtype=np.uint8)
     pixels[1, -6:, :6] = 255

@@ -15,7 +15,6 @@ from typing import Any
 from torchdeform.cohort.plan import Job, register_job
 from torchdeform.errors import InputError, explain
 from torchdeform.pipeline.memory import peak
-from torchdeform.pipeline.register import Outcome
 
 DONE, FAILED = "done", "failed"
 
@@ -84,9 +83,9 @@ def perform(task: Task) -> Report:
 
 def _register(job: Job, start: float) -> Report:
     outcome = register_job(job)
-    for warning in outcome.warnings:
+    for warning in outcome.record["warnings"]:
         sys.stderr.write(f"warning: {warning}\n")
-    return Report(DONE, "", perf_counter() - start, *_peaks(), _figures(outcome), outcome.files)
+    return Report(DONE, "", perf_counter() - start, *_peaks(), _figures(outcome.record), outcome.record["files"])
 
 
 def _sentence(error: Exception) -> str:
@@ -96,8 +95,7 @@ def _sentence(error: Exception) -> str:
     return explain(error)[0]
 
 
-def _figures(outcome: Outcome) -> dict[str, float]:
-    record: dict[str, Any] = outcome.record
+def _figures(record: dict[str, Any]) -> dict[str, float]:
     found = {name: record[name] for name in _FIGURES}
     for column, key in _MEASURED.items():
         for stage in ("before", "after"):

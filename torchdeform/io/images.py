@@ -91,6 +91,11 @@ def read_image(path: str | os.PathLike[str]) -> Image:
     return read_tiff(file) if ending in (".tif", ".tiff") and not other_kind(file) else _read_by_itk(file)
 
 
+def read_optional(path: Path | None) -> Image | None:
+    """Return the image of a file that may be left out."""
+    return None if path is None else read_image(path)
+
+
 def _read_gzip(path: Path) -> Image:
     """Decompress a file into a temporary folder and read it there."""
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""``report.html``: one page, complete in itself, on which a person judges a registration."""
+"""``report.html``: one page without other files, on which a person judges a registration."""
 
 import base64
 import hashlib
@@ -18,12 +18,12 @@ _MODES = {"swipe": "swipe", "flicker": "flicker", "checkerboard": "checkerboard"
 
 
 def write_report(path: Path, data: ReportData, record: Mapping[str, Any] | None = None) -> None:
-    """Write a page with everything that tells whether a registration went well: no network, less than 5 MB.
+    """Write a page that shows whether a registration went well; it needs no network and has less than 5 MB.
 
     Args:
         path: the file to write, usually ``report.html``.
-        data: what `make_report_data` returns; its slices are those the page can show.
-        record: what ``result.json`` holds; `describe` of the result when None, which knows no commands.
+        data: what `make_report_data` returns; the page can show its slices.
+        record: what ``result.json`` holds; when None that of `describe`, which has no commands.
     """
     known = describe(data.result, data.fixed, data.moving) if record is None else record
     page = _render(
@@ -42,7 +42,7 @@ def write_report(path: Path, data: ReportData, record: Mapping[str, Any] | None 
 
 
 def _render(**context: object) -> str:
-    """Fill the template: everything but our own style and script is escaped, and no other script can run."""
+    """Fill the template. All text is escaped, and the page's own script is the only one that can run."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
