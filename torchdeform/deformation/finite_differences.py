@@ -1,6 +1,6 @@
 """Least squares on finite differences: rows like the divergence and the curl of a field that is 0 on the boundary.
 
-The rows are Σ C_ka ∂_a v_k and the components of curl v, at all nodes and by the kernels of `derivatives`, one-sided at the
+The rows are Σ C_ka ∂_a v_k and the components of curl v at all nodes, by the kernels of `derivatives`, one-sided at the
 boundary. With C = I the first is the divergence, with the cofactors of ∇φ the linearised determinant. Their squares are
 summed with trapezoidal weights. So a field is found again from its own differences to rounding, which elements allow
 only up to the square of the spacing.
