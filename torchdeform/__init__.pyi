@@ -46,10 +46,14 @@ from .pipeline.config import load_settings
 from .registration.affine.align import Alignment, align
 from .registration.affine.settings import AlignmentSettings
 from .registration.deformable import register
-from .registration.discrete import DiscreteSettings, discrete_start
+from .registration.discrete import discrete_start
 from .registration.problem import Guidance
 from .registration.result import RegistrationResult
-from .registration.settings import RegistrationSettings
+from .registration.settings import (
+    DiscreteSettings,
+    RegistrationSettings,
+)
+from .registration.template import AveragingSettings, Template, build_template
 from .solvers.base import Solution, Status
 
 __version__: str
@@ -58,6 +62,7 @@ __all__ = [
     "Affine",
     "Alignment",
     "AlignmentSettings",
+    "AveragingSettings",
     "ComputationError",
     "DeformationSettings",
     "Diagnosis",
@@ -77,6 +82,7 @@ __all__ = [
     "Solution",
     "SolverSettings",
     "Status",
+    "Template",
     "TorchdeformError",
     "Transform",
     "Weights",
@@ -84,6 +90,7 @@ __all__ = [
     "average_maps",
     "ball_monitor",
     "box_monitor",
+    "build_template",
     "compose",
     "curl",
     "curvature_monitor",

@@ -8,12 +8,12 @@ import pytest
 import torch
 from cohort_files import GRID, cohort, write_images
 
+from torchdeform import AveragingSettings, build_template
 from torchdeform.cohort.schema import read_cohort
 from torchdeform.cohort.settings import TemplateSettings
 from torchdeform.cohort.template import Built, build
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.io import read_image, read_labels, read_transform
-from torchdeform.registration.template import AveragingSettings, build_template
 
 
 @pytest.fixture(scope="module")

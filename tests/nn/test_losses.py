@@ -27,7 +27,7 @@ def test_a_similarity_is_best_for_the_image_itself(name, grid):
 @pytest.mark.parametrize("name", ["ssd", "ncc", "lncc", "nmi", "ngf", "mind"])
 def test_similarity_gradcheck(name):
     images = torch.rand(2, 1, 1, 5, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    options = {} if name in ("ssd", "mind") else {"span": (-0.5, 1.5)}
+    options = {} if name in ("ssd", "mind") else {"intensity_range": (-0.5, 1.5)}
     loss = SimilarityLoss(name, **options)
     fixed, warped = images[0].requires_grad_(name != "ngf"), images[1].requires_grad_()  # its η counts as constant
     assert torch.autograd.gradcheck(loss, (fixed, warped), atol=1e-4)

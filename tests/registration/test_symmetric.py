@@ -8,7 +8,7 @@ import torch
 from pictures import bend, blobs, disc
 from torch import Tensor
 
-from torchdeform.core.fold_free import lowest_determinant, mended
+from torchdeform.core.fold_free import lowest_determinant, repair_folds
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, resample
 from torchdeform.core.transform import Affine
@@ -155,13 +155,13 @@ def folded(shape: tuple[int, ...]) -> Tensor:
 def test_mending_opens_folds_and_leaves_the_rest_alone(shape):
     grid, u = Grid(shape), folded(shape)
     assert (lowest_determinant(u, grid) < 0).any()
-    both = mended(torch.cat([u, bend(grid, 2.0)]), grid, 0.03)
+    both = repair_folds(torch.cat([u, bend(grid, 2.0)]), grid, 0.03)
     assert (lowest_determinant(both, grid) > 0.03).all()
     changed = ((both[:1] - u).abs() > 0).any(1)
     assert changed.sum() < 9**grid.dim
     assert torch.equal(both[1:], bend(grid, 2.0))
     edge = torch.zeros(1, grid.dim, *shape)
     edge[(0, slice(1, None), 0, *(n // 2 for n in shape[1:]))] = 3.0  # along the face, which it must not leave
-    flat = mended(edge, grid)
+    flat = repair_folds(edge, grid)
     assert (lowest_determinant(flat, grid) > 0).all()
     assert (flat[:, 0, 0] == 0).all()

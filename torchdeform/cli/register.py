@@ -136,7 +136,7 @@ def register(
 
 def summary(outcome: Outcome) -> str:
     """Return the most important figures of a registration in a few lines."""
-    r, measure = outcome.record, " + ".join(similarity_weights(outcome.result.settings.similarity))
+    r, measure = outcome.record, " + ".join(similarity_weights(outcome.result.settings.similarity.measure))
     lines = {
         f"similarity ({measure})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
         "folds": f"{r['folds']}, determinant {r['determinant_min']:.3g} to {r['determinant_max']:.3g}",

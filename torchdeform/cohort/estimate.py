@@ -63,8 +63,9 @@ def _seconds(job: Job, size: tuple[tuple[int, ...], int] | None) -> float | None
             grid = fitting_grid(grid, job.memory, channels, settings)
         except InputError:  # the pair itself will say so
             return None
-    levels = pyramid_grids(grid, len(settings.steps))
-    steps = settings.steps[len(settings.steps) - len(levels) :]
+    wanted = settings.optimiser.steps
+    levels = pyramid_grids(grid, len(wanted))
+    steps = wanted[len(wanted) - len(levels) :]
     node_steps = sum(math.prod(g.shape) * steps_on(g, n, settings) for g, n in zip(levels, steps, strict=True))
     fields = (2 if symmetric else 1) * channels * sum(measure.time for measure in measures.values())
     return _PAIR + fields * _PER_NODE_STEP[grid.dim] * node_steps

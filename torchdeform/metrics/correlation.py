@@ -6,7 +6,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchdeform.core.resampling import box_spread, box_sum, centres
+from torchdeform.core.resampling import box_sum, box_sum_transpose, centres
 from torchdeform.metrics.base import (
     IntensityRange,
     Similarity,
@@ -63,8 +63,8 @@ def ncc(fixed: Tensor, warped: Tensor, *, mask: Tensor | None = None, intensity_
         fixed: ``(B, C, *S)``, any unit.
         warped: the same shape, any unit.
         mask: weight of each voxel ``(B, 1, *S)``, 0 to 1; all ones when None.
-        intensity_range: intensities taken for 0 and 1, which gives ε = 1e-8 its meaning; None: the smallest and the largest of
-            each image where the mask is positive.
+        intensity_range: intensities taken for 0 and 1, which gives ε = 1e-8 its meaning; None: the smallest and the
+            largest of each image where the mask is positive.
 
     Returns:
         ``(B,)``, the mean over channels. Flat images give 0.
@@ -140,9 +140,8 @@ class LocalCrossCorrelation(Similarity):
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         warped = at_least_float32(warped)
         windows = self._windows(mask, warped)
-        sums = box_sum(_products(warped, self.fixed, windows.weight), self.window, self.stride).mul_(
-            windows.inverse_count
-        )
+        sums = box_sum(_products(warped, self.fixed, windows.weight), self.window, self.stride)
+        sums.mul_(windows.inverse_count)
         warped_mean, square, product = sums.chunk(3, dim=1)
         covariance = product.addcmul_(warped_mean, windows.mean, value=-1)
         variance = square.addcmul_(warped_mean, warped_mean, value=-1).clamp_(min=0).add_(LNCC_FLOOR)
@@ -151,7 +150,7 @@ class LocalCrossCorrelation(Similarity):
         a = correlation.mul_(windows.inverse_count * (2 * warped[0, 0].numel() / correlation[0, 0].numel()))
         b = a * covariance / variance
         back = torch.cat([a, b, b * warped_mean - a * windows.mean], dim=1)
-        a, b, rest = box_spread(back, self.window, self.stride, tuple(warped.shape[2:])).chunk(3, dim=1)
+        a, b, rest = box_sum_transpose(back, self.window, self.stride, tuple(warped.shape[2:])).chunk(3, dim=1)
         slope = torch.addcmul(rest, self.fixed, a).addcmul_(warped, b, value=-1)
         return value, slope if windows.weight is None else slope.mul_(windows.weight)
 
@@ -172,8 +171,8 @@ def lncc(
         warped: the same shape, any unit.
         mask: weight of each voxel ``(B, 1, *S)``, 0 to 1, in the windows and of the windows; all ones when None.
         window: width in voxels, odd. At the boundary the part of the window inside the image counts.
-        intensity_range: intensities taken for 0 and 1, which gives ε = 1e-5 its meaning; None: the smallest and the largest of
-            each image where the mask is positive.
+        intensity_range: intensities taken for 0 and 1, which gives ε = 1e-5 its meaning; None: the smallest and the
+            largest of each image where the mask is positive.
         stride: voxels from one x to the next along every axis.
 
     Returns:
@@ -204,8 +203,9 @@ def _moments(
     image: Tensor, weight: Tensor | None, inverse_count: Tensor, window: int, stride: int
 ) -> tuple[Tensor, Tensor]:
     """Return mean and variance + ε in the window around each voxel."""
-    fields = weighted(torch.cat([image, image * image], dim=1), weight)
-    first, square = (box_sum(fields, window, stride) * inverse_count).chunk(2, dim=1)
+    first = weighted(image, weight)
+    sums = box_sum(torch.cat([first, first * image], dim=1), window, stride)
+    first, square = (sums * inverse_count).chunk(2, dim=1)
     return first, (square - first * first).clamp(min=0) + LNCC_FLOOR
 
 

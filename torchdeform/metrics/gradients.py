@@ -74,8 +74,8 @@ def ngf(
             among those that its differences use.
         grid: their grid; spacing 1 when None.
         edge: η in units of the mean of |∇f|; shorter gradients count as noise. From 1 on, steeper is more similar.
-        intensity_range: intensities taken for 0 and 1, so that one η suits both images; None: the smallest and the largest of each
-            image where the mask is positive.
+        intensity_range: intensities taken for 0 and 1, so that one η suits both images; None: the smallest and the
+            largest of each image where the mask is positive.
 
     Returns:
         ``(B,)`` between 0 and 1. Flat regions give 0.

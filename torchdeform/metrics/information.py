@@ -127,8 +127,8 @@ def mutual_information(
         warped: the same shape, any unit.
         mask: weight of each voxel ``(B, 1, *S)``, 0 to 1; all ones when None.
         bins: along each axis of the histogram, at least 5.
-        intensity_range: intensities of the first and the last bin, what lies outside counts there; None: the smallest and the
-            largest of each image where the mask is positive.
+        intensity_range: intensities of the first and the last bin, which also get what is outside; None: the smallest
+            and the largest of each image where the mask is positive.
 
     Returns:
         ``(B,)`` in nats, the mean over channels; 0 for independent images.
@@ -138,7 +138,7 @@ def mutual_information(
 
     Notes:
         Bins overlap as in `MutualInformation`, which has the derivative in closed form. Differentiable, no derivative
-        going through the intensity_range. Viola & Wells 1997; Thévenaz & Unser 2000.
+        going through the range. Viola & Wells 1997; Thévenaz & Unser 2000.
     """
     return _from_images((fixed, warped), mask, bins, intensity_range, _mutual)
 

@@ -21,7 +21,7 @@ from torchdeform.io.points import matched, read_points
 from torchdeform.metrics.evaluation import common_labels
 from torchdeform.pipeline.memory import available, fitting_grid, footprint, peak, readable
 from torchdeform.pipeline.preflight import WARNING, preflight
-from torchdeform.registration.deformable import onto_grid
+from torchdeform.registration.deformable import resample_result
 from torchdeform.registration.problem import Guidance
 from torchdeform.registration.result import Callback, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
@@ -127,7 +127,7 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
         moving,
         fixed_mask=masks[0],
         moving_mask=masks[1],
-        aligned=settings.align != "none",
+        aligned=settings.align.kind != "none",
         settings=settings,
         memory=memory,
     )
@@ -188,7 +188,7 @@ def register_files(
     moving, guidance = inputs.moving.to(where), inputs.guidance.to(where)
     result = register(fixed.to(where), moving, settings, guidance=guidance, callback=callback)
     if fixed is not inputs.fixed:  # a coarser grid was registered
-        result = onto_grid(result, inputs.fixed.to(where), moving, guidance)
+        result = resample_result(result, inputs.fixed.to(where), moving, guidance)
     _require_finite(result)
     run.peaks[next(reversed(result.seconds), "register")] = peak()
     found = result.alignment.warnings if result.alignment else ()

@@ -2,9 +2,10 @@
 
 import json
 import shlex
-from collections.abc import Mapping
-from dataclasses import fields
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import Any
 
 from torchdeform.core.interpolation import LABEL_MODE
 from torchdeform.registration.settings import RegistrationSettings
@@ -33,9 +34,17 @@ def repeat_command(
 
 
 def changed(settings: RegistrationSettings) -> dict[str, object]:
-    """Return the settings that differ from the defaults."""
-    names, defaults = (field.name for field in fields(settings)), RegistrationSettings()
-    return {name: getattr(settings, name) for name in names if getattr(settings, name) != getattr(defaults, name)}
+    """Return the settings that differ from the defaults, by their dotted names."""
+    return dict(_differences(settings, RegistrationSettings(), ""))
+
+
+def _differences(group: Any, defaults: Any, prefix: str) -> Iterator[tuple[str, object]]:
+    for name in (field.name for field in fields(group)):
+        value, default = getattr(group, name), getattr(defaults, name)
+        if is_dataclass(value):
+            yield from _differences(value, default, f"{prefix}{name}.")
+        elif value != default:
+            yield f"{prefix}{name}", value
 
 
 def apply_commands(inputs: Mapping[str, str], out: Path) -> dict[str, str]:

@@ -202,7 +202,7 @@ def _plain(axes: "Axes") -> None:
 
 def measure_name(result: RegistrationResult) -> str:
     """Return the name of the similarity, or of several."""
-    return " + ".join(similarity_weights(result.settings.similarity))
+    return " + ".join(similarity_weights(result.settings.similarity.measure))
 
 
 def tinted(first: Floats, second: Floats) -> Floats:

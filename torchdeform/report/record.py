@@ -31,7 +31,7 @@ def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[st
     return {
         "fixed": _place(fixed),
         "moving": _place(moving),
-        "similarity": result.settings.similarity,
+        "similarity": result.settings.similarity.measure,
         "similarity_before": result.similarity_before.item(),
         "similarity_after": result.similarity_after.item(),
         "folds": int(diagnosis.folds.item()),
@@ -68,7 +68,7 @@ def _alignment(result: RegistrationResult) -> dict[str, object]:
         return {"kind": "none"}
     found = result.alignment
     return {
-        "kind": result.settings.align if found else "given",
+        "kind": result.settings.align.kind if found else "given",
         "matrix": result.affine.matrix.tolist(),
         "offset": result.affine.offset.tolist(),
         "start": found and found.start,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchdeform.core.grid import threads_worth
+from torchdeform.core.grid import limit_threads
 from torchdeform.core.image import background, centre_of_mass
 from torchdeform.registration.affine.bfgs import maximise
 from torchdeform.registration.affine.lie import angle, generators, homogeneous, rotations
@@ -93,7 +93,7 @@ def optimised(
 ) -> list[Candidate]:
     """Return the candidates after some steps of `maximise`, the most similar first."""
     starts = torch.stack([c.map for c in candidates])
-    with threads_worth(len(candidates) * objective.fields, objective.fixed.image.grid):
+    with limit_threads(len(candidates) * objective.fields, objective.fixed.image.grid):
         maps, values = maximise(objective, starts, moves, steps=steps, shortest=shortest)
     moved = [Candidate(c.name, m, float(v)) for c, m, v in zip(candidates, maps, values, strict=True)]
     return sorted(moved, key=lambda c: -c.value)

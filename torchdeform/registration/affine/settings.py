@@ -47,18 +47,18 @@ class AlignmentSettings:
     steps: int = 40
 
     def __post_init__(self) -> None:
-        require_choice(self.kind, ALIGNMENTS, "kind")
+        require_choice(self.kind, ALIGNMENTS, "align.kind")
         similarity_weights(self.similarity)
         if not isinstance(self.similarity, str):  # a copy of our own, and a dict, which `asdict` can take
             object.__setattr__(self, "similarity", dict(self.similarity))
         if self.window is not None and (self.window < 3 or self.window % 2 == 0):
-            raise InputError(f"window must be an odd number of voxels, at least 3, got {self.window}")
+            raise InputError(f"align.window must be an odd number of voxels, at least 3, got {self.window}")
         if not 0 < self.min_overlap <= 1:
-            raise InputError(f"min_overlap must lie between 0 and 1, got {self.min_overlap}")
+            raise InputError(f"align.min_overlap must lie between 0 and 1, got {self.min_overlap}")
         if self.nodes is not None and self.nodes < COARSEST_NODES:
-            raise InputError(f"nodes must be at least {COARSEST_NODES}, got {self.nodes}")
+            raise InputError(f"align.nodes must be at least {COARSEST_NODES}, got {self.nodes}")
         if self.steps < 1:
-            raise InputError(f"steps must be at least 1, got {self.steps}")
+            raise InputError(f"align.steps must be at least 1, got {self.steps}")
 
     def window_in(self, dim: int) -> int:
         """Return the width of the window for images of ``dim`` axes."""
