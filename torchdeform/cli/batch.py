@@ -77,7 +77,7 @@ def _run(work: Plan, whole: Plan, engine: EngineSettings, progress: CohortProgre
         write_json(description(), work.out / DESCRIPTION)
         return summary
     finally:
-        if work is not whole:
+        if work is not whole:  # `run` wrote the summary of some pairs only
             review(whole.jobs, whole.out, whole.problems)
 
 

@@ -42,9 +42,10 @@ def check(
 
     Orientations say where x, y and z point to: LPS is left, posterior, superior. Exit code 2 if there is an error.
     """
+    # Options are checked before images are read, which may take long.
     require_choice(align, ALIGNMENTS, "--align")
     if out is not None and suffix(out) != ".png":
-        raise InputError(f"--out {out}: the picture is a PNG; let its name end in .png")
+        raise InputError(f"--out {out}: the picture is a PNG; give a name that ends in .png")
     images = read_image(fixed), read_image(moving)
     masks = read_optional(fixed_mask), read_optional(moving_mask)
     report = preflight(*images, fixed_mask=masks[0], moving_mask=masks[1], aligned=align != "none")

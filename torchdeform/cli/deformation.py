@@ -1,4 +1,4 @@
-"""``grid``, ``reconstruct``, ``simulate``: the deformation method at the shell."""
+"""``grid``, ``reconstruct``, ``simulate``: the deformation method."""
 
 import os
 from pathlib import Path
@@ -74,6 +74,7 @@ def adapt_grid(
 
     Writes displacement.nii.gz (where each node goes), monitor.nii.gz, grid.png and result.json.
     """
+    # typer knows no Literal types, so `GridSettings` checks the names.
     settings = GridSettings(cast(MonitorName, monitor), f_min, f_max, smoothing, cast(VelocityName, velocity))
     folder = out or Path(f"{stem(image)}-grid")
     record = adapt_grid_to_file(image, folder, settings, choose_device(device))

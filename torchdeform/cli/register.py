@@ -109,6 +109,7 @@ def register(
     and result.json, all or none. transform.h5 maps points from FIXED to MOVING and warps the image MOVING onto FIXED;
     inverse.h5 does the opposite.
     """
+    # Options that were not given must not override the preset and the file.
     shortcuts = {"align": align, "points_weight": points_weight, "symmetric": symmetric or None}
     overrides = {key: value for key, value in shortcuts.items() if value is not None}
     settings = load_settings(preset, config, dict(map(parse_override, assignments or [])) | overrides)
@@ -129,7 +130,7 @@ def register(
     if json:
         print_json({**outcome.record, "out": str(outcome.folder)})
     elif not quiet:
-        for warning in outcome.record["warnings"]:
+        for warning in outcome.record["warnings"]:  # on stderr: standard output has the figures only
             typer.echo(f"warning: {warning}", err=True)
         typer.echo(summary(outcome))
 

@@ -52,7 +52,7 @@ class _Rounds:
 
     def show(self, number: int, event: Event) -> None:
         """Show an event of a round."""
-        if number != self._number:
+        if number != self._number:  # the bar of the last round ends before the next one starts
             self._open.close()
             title = f"round {number} of {self._rounds},"
             self._number, self._progress = number, self._open.enter_context(CohortProgress(self._quiet, title))

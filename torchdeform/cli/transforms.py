@@ -82,7 +82,7 @@ def apply(
     image of the fixed space goes to the moving space.
     """
     require_choice(interpolation, MODES, "--interpolation")
-    _prepare_image(out, transform, moving, reference)
+    _require_image_output(out, transform, moving, reference)
     labels = interpolation in COPYING
     chain = _read(transform, inverse)
     place = _place(chain, reference, transform)
@@ -104,7 +104,7 @@ def points(
     points of the moving image go to the fixed image.
     """
     require_points_file(out)
-    _prepare(out, transform, points, reference)
+    _require_output(out, transform, points, reference)
     chain = _read(transform, inverse)
     given = read_points(points, read_optional(reference), dim=chain.dim)
     write_points(replace(given, positions=chain.points(given.positions)), out)
@@ -113,13 +113,13 @@ def points(
 def invert(
     transform: TransformFile, out: OutFile, reference: FieldGrid = None, json: Json = False, quiet: Quiet = False
 ) -> None:
-    """Write the inverse of TRANSFORM, which takes points from moving to fixed and images from fixed to moving.
+    """Write the inverse of TRANSFORM, which maps points from moving to fixed and images from fixed to moving.
 
     Affine maps are inverted exactly, displacement fields on their own grid. Prints how far a point is from its start
     after TRANSFORM and its inverse.
     """
     require_transform_file(out)
-    _prepare(out, transform, reference)
+    _require_output(out, transform, reference)
     chain = _read(transform)
     inverse = _on_grid(chain.inverse(), reference)
     write_transform(inverse, out)
@@ -139,7 +139,7 @@ def compose(transforms: TransformFiles, out: OutFile, reference: FieldGrid = Non
     transforms in the same order.
     """
     require_transform_file(out)
-    _prepare(out, *transforms, reference)
+    _require_output(out, *transforms, reference)
     if len(transforms) < 2:
         raise InputError(
             "compose needs at least two transforms; give them in the order in which points go through them"
@@ -152,10 +152,10 @@ def jacobian(
 ) -> None:
     """Write the Jacobian determinant of TRANSFORM on the grid of the fixed image: moving volume over fixed volume.
 
-    Points go from fixed to moving: above 1 a piece of the fixed image is larger in the moving image, below 1 smaller,
+    Points go from fixed to moving: above 1 a piece of the fixed image is larger in the moving image, below 1 smaller;
     0 or less is a fold.
     """
-    _prepare_image(out, transform, reference)
+    _require_image_output(out, transform, reference)
     chain = _read(transform)
     image = chain.jacobian_determinant(_place(chain, reference, transform))
     write_image(image, out)
@@ -185,14 +185,17 @@ def _on_grid(chain: Transform, reference: Path | None) -> Transform:
     return chain if reference is None else replace(chain, fixed=read_image(reference))
 
 
-def _prepare_image(out: Path, *inputs: Path | None) -> None:
+def _require_image_output(out: Path, *inputs: Path | None) -> None:
     if suffix(out) not in FORMATS:
         raise InputError(f"{out} has no ending that images are written with; use one of {', '.join(FORMATS)}")
-    _prepare(out, *inputs)
+    _require_output(out, *inputs)
 
 
-def _prepare(out: Path, *inputs: Path | None) -> None:
-    """Raise `InputError` if the result cannot be written, or would replace a file that it is made from."""
+def _require_output(out: Path, *inputs: Path | None) -> None:
+    """Raise `InputError` if the result cannot be written, or would replace a file that it is made from.
+
+    Called before anything is read, so that a wrong name costs no time.
+    """
     for path in inputs:
         if path is not None and out.exists() and path.exists() and out.samefile(path):
             raise InputError(f"--out {out} is one of the files to read; choose another name")

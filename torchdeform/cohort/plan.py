@@ -84,18 +84,18 @@ class Plan:
     jobs: tuple[Job, ...]
     problems: tuple[Failure, ...] = ()
 
-    def only(self, wanted: Iterable[str]) -> "Plan":
+    def only(self, names: Iterable[str]) -> "Plan":
         """Return the plan of the pairs with these names, starts of names (``sub-01``) or patterns (``sub-0*``).
 
         Raises:
             InputError: a name that no pair has.
         """
-        names = [one.name for one in (*self.jobs, *self.problems)]
+        known = [one.name for one in (*self.jobs, *self.problems)]
         kept: set[str] = set()
-        for name in wanted:
-            found = select(names, name)
+        for name in names:
+            found = select(known, name)
             if not found:
-                raise InputError(f"--only: no pair is called {name!r}{nearest_name(name, names)}; see --dry-run")
+                raise InputError(f"--only: no pair is called {name!r}{nearest_name(name, known)}; see --dry-run")
             kept.update(found)
         jobs, problems = ([one for one in some if one.name in kept] for some in (self.jobs, self.problems))
         return replace(self, jobs=tuple(jobs), problems=tuple(problems))

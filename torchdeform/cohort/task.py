@@ -71,7 +71,7 @@ def perform(task: Task) -> PairReport:
     """Register a pair and report. Every error but the end of the process becomes a report, too.
 
     Notes:
-        Everything that the process prints meanwhile goes to the log, even the traceback of a crash.
+        Everything that the process prints in that time goes to the log, even the traceback of a crash.
     """
     start = perf_counter()
     with _logged(task.log):

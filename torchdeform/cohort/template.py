@@ -54,7 +54,7 @@ class Built:
 
     Attributes:
         folder: of the results.
-        record: what ``result.json`` holds.
+        record: the content of ``result.json``.
         failures: images that could not be registered, and why.
     """
 
@@ -71,7 +71,7 @@ class Round:
         number: from 1.
         folder: of its registrations and its template.
         reference: the image that all others are registered to.
-        subjects: the images that take part.
+        subjects: the images of the round.
         key: a hash of everything that its template depends on.
     """
 

@@ -24,9 +24,9 @@ class Engine:
 
     Attributes:
         executor: the executor for a job, by what the job needs.
-        window: how many jobs are handed over at a time.
+        window: number of jobs that are submitted at a time.
         function: what the executor calls with a task.
-        arguments: and with these besides.
+        arguments: further arguments of that function.
     """
 
     executor: Callable[[Job], Executor]
@@ -35,7 +35,7 @@ class Engine:
     arguments: tuple[object, ...] = ()
 
     def submit(self, task: Task) -> Future[PairReport]:
-        """Hand a pair over."""
+        """Submit a pair."""
         return self.executor(task.job).submit(self.function, task, *self.arguments)
 
 
