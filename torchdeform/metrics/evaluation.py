@@ -1,6 +1,7 @@
-"""How well two images fit, by what an expert knows about them: overlap and distance of regions, landmarks."""
+"""How well two images fit by what an expert marked: overlap and distance of regions, distance of landmarks."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -41,7 +42,7 @@ class Evaluation:
         before: with both images where they are.
         aligned: after the affine map; None without one.
         after: after the affine map and the displacement.
-        label_interpolation: how the labels of the moving image were carried, a mode of `interpolator`; None without.
+        label_interpolation: how labels of the moving image were interpolated, a mode of `interpolator`; None without.
     """
 
     before: Measures
@@ -94,24 +95,14 @@ def evaluate_images(
         return None
 
     def at(world: Affine | None, w: Tensor) -> Measures:
-        seen = regions and (regions[0], _carried_labels(regions[1], fixed, world, w))
-        pairs = points and (carry_points(points[0], fixed, world, w), points[1])
-        return _measures(seen, pairs, fixed.grid, regions and (regions[0], regions[1].data))
+        make = partial(Transform.from_displacement, fixed=fixed, affine=world)
+        warped = regions and (regions[0], make(w).labels(regions[1], fixed).data)
+        pairs = points and (make(w.double()).points(points[0].double().to(w.device)), points[1])
+        return _measures(warped, pairs, fixed.grid, regions and (regions[0], regions[1].data))
 
     zero = u.new_zeros(()).expand_as(u)  # takes no memory
     aligned = None if affine is None else at(affine, zero)
     return Evaluation(at(None, zero), aligned, at(affine, u), regions and LABEL_MODE)
-
-
-def carry_points(points: Tensor, fixed: Image, affine: Affine | None, u: Tensor) -> Tensor:
-    """Return A(φ(p)) for points p of the world ``(1, D, n)``, φ = id + u on the grid of the fixed image."""
-    place = fixed.to_grid(points.double().to(u.device))
-    world = fixed.to_world(place + sample(u.double(), place, fixed.grid))
-    return world if affine is None else affine(world)
-
-
-def _carried_labels(labels: Image, fixed: Image, affine: Affine | None, u: Tensor) -> Tensor:
-    return Transform.from_displacement(u, fixed, affine=affine).labels(labels, fixed).data
 
 
 def _warped_labels(labels: Tensor, u: Tensor, grid: Grid) -> Tensor:
