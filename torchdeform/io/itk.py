@@ -73,7 +73,7 @@ def _execute(reader: "sitk.ImageFileReader") -> "sitk.Image | RuntimeError":
 
 
 def quietly(work: Callable[[], _Result]) -> "_Result | RuntimeError":
-    """Return what ``work`` returns, or the error that it raises. What ITK prints meanwhile is dropped."""
+    """Return what ``work`` returns, or the error that it raises. What ITK prints is dropped."""
     with native_stderr(), _no_warnings():
         try:
             return work()

@@ -90,7 +90,7 @@ def adapt_grid_to_file(image: Path, out: Path, settings: GridSettings, device: t
         device: where to compute.
 
     Returns:
-        What ``result.json`` holds.
+        The content of ``result.json``.
 
     Raises:
         InputError: the file, the folder, or a monitor that is not positive.
@@ -135,7 +135,7 @@ def reconstruct_file(
         device: where to compute.
 
     Returns:
-        What ``result.json`` holds; ``distance_max`` is the largest distance between given and reconstructed nodes.
+        The content of ``result.json``; ``distance_max`` is the largest distance between given and reconstructed nodes.
 
     Raises:
         InputError: the file, the folder, order or steps.
@@ -192,7 +192,7 @@ def simulate_file(
         smoothing: standard deviation of the Gaussian that smooths borders, units of spacing; the spacing when None.
 
     Returns:
-        What ``result.json`` holds.
+        The content of ``result.json``.
 
     Raises:
         InputError: the files, positions that differ, labels or factors.
