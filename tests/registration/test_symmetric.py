@@ -10,10 +10,9 @@ from pictures import bend, blobs, disc
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, resample
-from torchdeform.core.transform import Affine
+from torchdeform.core.transform import Affine, Transform
 from torchdeform.core.warp import compose, max_voxels, voxels, warp
 from torchdeform.errors import InputError
-from torchdeform.metrics.evaluation import carry_points
 from torchdeform.registration.deformable import register
 from torchdeform.registration.problem import Guidance, moved
 from torchdeform.registration.symmetric import common_axes, midspace_frame, root
@@ -100,8 +99,8 @@ def test_swapping_images_on_different_grids_inverts_the_map():
     back = register(moving, fixed, SYMMETRIC, affine=affine.inverse())
     x, y = torch.meshgrid(torch.linspace(25, 60, 9), torch.linspace(26, 60, 9), indexing="ij")
     points = torch.stack([x.flatten(), y.flatten()]).unsqueeze(0).double()
-    ends = carry_points(points, fixed, affine, there.displacement)
-    returned = carry_points(ends, moving, affine.inverse(), back.displacement)
+    ends = Transform.from_displacement(there.displacement, fixed, affine=affine).points(points)
+    returned = Transform.from_displacement(back.displacement, moving, affine=affine.inverse()).points(ends)
     apart = (returned - points).norm(dim=1)
     assert (ends - affine(points)).norm(dim=1).mean() > 1
     assert apart.mean() < 0.05

@@ -286,7 +286,7 @@ class Transform:
 
         Args:
             moving: image in the moving space, any grid and any number of channels.
-            reference: whose grid the result is wanted on; `reference` of this transform when None.
+            reference: grid of the result; `reference` of this transform when None.
             mode: ``nearest``, ``linear``, ``cubic`` or ``label``; see `torchdeform.core.interpolation.interpolator`.
             outside: value where φ(x) is outside the moving image (ITK's resampler uses 0); None continues its edge.
 
@@ -307,18 +307,18 @@ class Transform:
         return replace(place, data=pixels, name=moving.name, pixel_type=moving.pixel_type)
 
     def labels(self, moving: Image, reference: Image | None = None, *, mode: str = LABEL_MODE) -> Image:
-        """Return the labels of the moving image in the fixed space: `image` by a vote around each point, 0 outside.
+        """Return the labels of the moving image in the fixed space: by `image` in mode ``label``, 0 outside.
 
         Args:
             moving: whole numbers in the moving space.
             reference: as in `image`.
-            mode: ``label``, whose borders stay smooth, or ``nearest``, which keeps the thinnest parts.
+            mode: ``label``, with smooth borders, or ``nearest``, which keeps the thinnest parts.
 
         Raises:
             InputError: as `image`; labels that are not finite.
 
         Notes:
-            Values are copied, never computed, so integers stay integers; labels above 2²⁴ want float64 ``data``.
+            Values are copied, never computed, so integers stay integers; labels above 2²⁴ need float64 ``data``.
         """
         return self.image(moving, reference, mode=mode)
 

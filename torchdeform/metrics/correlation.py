@@ -6,7 +6,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchdeform.core.resampling import box_spread, box_sum, centres
+from torchdeform.core.resampling import box_sum, box_sum_transpose, centres
 from torchdeform.metrics.base import (
     IntensityRange,
     Similarity,
@@ -150,7 +150,7 @@ class LocalCrossCorrelation(Similarity):
         a = correlation.mul_(windows.inverse_count * (2 * warped[0, 0].numel() / correlation[0, 0].numel()))
         b = a * covariance / variance
         back = torch.cat([a, b, b * warped_mean - a * windows.mean], dim=1)
-        a, b, rest = box_spread(back, self.window, self.stride, tuple(warped.shape[2:])).chunk(3, dim=1)
+        a, b, rest = box_sum_transpose(back, self.window, self.stride, tuple(warped.shape[2:])).chunk(3, dim=1)
         slope = torch.addcmul(rest, self.fixed, a).addcmul_(warped, b, value=-1)
         return value, slope if windows.weight is None else slope.mul_(windows.weight)
 

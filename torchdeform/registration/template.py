@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.diagnostics import smallest_determinant
+from torchdeform.core.fold_free import largest_share
+from torchdeform.core.grid import per_item
 from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Transform, place_of
 from torchdeform.core.warp import compose, invert, max_voxels
@@ -182,8 +184,8 @@ def _map(reference: Image, image: Image, config: RegistrationSettings | None, ca
 
 def identity_map(image: Image) -> Transform:
     """Return the identity of an image's space, as a displacement of 0 on its grid."""
-    still = image.data.new_zeros(1, image.grid.dim, *image.grid.shape)
-    return Transform.from_displacement(still, image, inverse=still, moving=image)
+    zero = image.data.new_zeros(1, image.grid.dim, *image.grid.shape)
+    return Transform.from_displacement(zero, image, inverse=zero, moving=image)
 
 
 @torch.no_grad()
@@ -280,14 +282,18 @@ def _mean_displacement(maps: Sequence[Transform], back: Tensor, reference: Image
 
 def _corrected(total: Tensor, mean: Tensor, reference: Image) -> Tensor:
     """Return (id + mean) ∘ (id + total), with less of the mean where all of it would fold."""
-    for _ in range(_HALVINGS):
-        after = compose(mean, total, reference.grid)
-        if bool((smallest_determinant(after, reference.grid) > 0).all()):
-            return after
-        mean = mean / 2
-    raise ComputationError(
-        f"{reference.name}: the mean shape cannot be reached without folds; take another image as reference"
-    )
+    grid = reference.grid
+
+    def corrected(share: Tensor) -> Tensor:
+        return compose(per_item(share, mean) * mean, total, grid)
+
+    def accept(share: Tensor) -> Tensor:
+        return smallest_determinant(corrected(share), grid) > 0
+
+    share = largest_share(accept, mean.new_ones(1), halvings=_HALVINGS)
+    if not bool(share > 0):
+        raise ComputationError(f"{reference.name}: its mean shape folds; take another image as reference")
+    return corrected(share)
 
 
 def _mean_affine(maps: Sequence[Transform], reference: Image, pose: Pose) -> Affine | None:
