@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from nested_settings import changed
 
 from torchdeform.cohort.estimate import Costs, estimate, measure
 from torchdeform.cohort.plan import Job
@@ -18,7 +19,7 @@ from torchdeform.pipeline.register import PairFiles
 def test_needs_are_those_of_the_estimate(jobs, tmp_path):
     volume = tmp_path / "missing.nii.gz"
     unknown = replace(jobs[0], files=replace(jobs[0].files, fixed=volume))
-    symmetric = replace(jobs[0], settings=replace(jobs[0].settings, symmetric=True))
+    symmetric = replace(jobs[0], settings=changed(jobs[0].settings, symmetric=True))
     small, limited = replace(jobs[0], memory=10**12), replace(unknown, memory=5)
     one, two, none, same, five = measure([jobs[0], symmetric, unknown, small, limited])
     assert one == same > 4e8

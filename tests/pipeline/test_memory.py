@@ -9,6 +9,7 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 from memory import QUICK, estimated, measure  # type: ignore[attr-defined]
+from nested_settings import settings_of
 
 import torchdeform.pipeline.memory as memory
 from torchdeform.core.grid import Grid
@@ -16,17 +17,16 @@ from torchdeform.core.resampling import MIN_NODES
 from torchdeform.errors import InputError
 from torchdeform.metrics.similarity import MEASURES
 from torchdeform.pipeline.memory import available, fitting_grid, footprint, parse_size, peak, readable
-from torchdeform.registration.settings import RegistrationSettings
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="measured by what Linux tells of a process")
 
 
 def need(grid: Grid, channels: int = 1, **settings: object) -> int:
-    return footprint(grid, channels, RegistrationSettings(**settings))
+    return footprint(grid, channels, settings_of(**settings))
 
 
 def fitting(grid: Grid, limit: int, **settings: object) -> Grid:
-    return fitting_grid(grid, limit, 1, RegistrationSettings(**settings))
+    return fitting_grid(grid, limit, 1, settings_of(**settings))
 
 
 @linux

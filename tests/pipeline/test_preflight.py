@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from lopsided import lopsided
+from nested_settings import settings_of
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
@@ -122,7 +123,7 @@ def test_scaled_intensities_matter_to_ssd():
     fixed = lopsided(2)
     moving = replace(fixed, data=fixed.data / 4095, name="moving.nii")
     assert "another similarity than ssd" in texts(
-        preflight(fixed, moving, settings=RegistrationSettings(similarity="ssd")), WARNING
+        preflight(fixed, moving, settings=settings_of(similarity="ssd")), WARNING
     )
 
 
@@ -188,7 +189,7 @@ def test_memory_that_will_not_do(monkeypatch):
 
 def test_the_memory_of_what_will_be_registered(monkeypatch):
     """Two maps take more than one, and a limit that is given is kept to, so nothing is said."""
-    fixed, one, both = lopsided(3), RegistrationSettings(), RegistrationSettings(symmetric=True)
+    fixed, one, both = lopsided(3), RegistrationSettings(), settings_of(symmetric=True)
     between = (footprint(fixed.grid, 1, one) + footprint(fixed.grid, 1, both)) / 2
     monkeypatch.setattr("torchdeform.pipeline.preflight.available", lambda device: between / 0.8)
     assert preflight(fixed, fixed, settings=one).findings == ()

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 import torch
+from nested_settings import settings_of
 
 from torchdeform.core.transform import Affine
 from torchdeform.metrics.evaluation import Evaluation, Measures
 from torchdeform.registration.affine.align import Alignment
-from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.command_lines import repeat_command
 from torchdeform.report.record import describe
 from torchdeform.report.report_data import ReportData, make_report_data
@@ -36,7 +36,7 @@ def make_full(make_image, make_result) -> Callable[..., tuple[ReportData, dict[s
         shape = images.pop("shape", SHAPES[dim])
         fixed = make_image(shape, name=f"/data/{NASTY}/fixed{NASTY}.nii.gz", **images)
         moving = make_image(tuple(n - 3 for n in shape), (1.1,) * dim, name="moving.nii.gz", **images)
-        settings = RegistrationSettings(similarity={"lncc": 1.0, "mi": 0.5}, steps=(5, 4))
+        settings = settings_of(similarity={"lncc": 1.0, "mi": 0.5}, steps=(5, 4))
         result = make_result(fixed, moving, settings)
         shift = Affine(torch.eye(dim, dtype=torch.float64), torch.ones(dim, dtype=torch.float64))
         result = replace(

@@ -242,7 +242,7 @@ def midspace_of_images(fixed: PlacedImage, moving: PlacedImage, affine: Affine |
         axes: direction of the grid, from `common_axes`.
 
     Raises:
-        InputError: as `root`, `middle_frame`.
+        InputError: as `root`, `midspace_frame`.
     """
     half = root(affine or Affine.identity(fixed.image.grid.dim))
     back = half.inverse()
