@@ -275,7 +275,7 @@ def test_a_folder_without_permission_is_named(volumes, capsys):
 DIRECTIONS = {
     "apply": ["onto the grid of the fixed image", "Images go from moving to fixed", "points from fixed to moving"],
     "points": ["Points go from fixed to moving", "brings the moving image to the fixed one"],
-    "invert": ["takes points from moving to fixed", "images from fixed to moving"],
+    "invert": ["maps points from moving to fixed", "images from fixed to moving"],
     "compose": ["points go through FIRST, then SECOND", "images the other way"],
     "jacobian": ["Points go from fixed to moving", "moving volume over fixed volume"],
 }

@@ -194,7 +194,8 @@ def _register_all(jobs: Sequence[Job], engine: Engine, state: _State) -> None:
     waiting, running = iter(jobs), dict[Future[PairReport], tuple[Job, str]]()
     try:
         while _fill(running, waiting, engine, state):
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
+            finished = wait(running, return_when=FIRST_COMPLETED).done
+            for future in [future for future in running if future in finished]:  # in the order of submission
                 job, key = running[future]
                 state.record(job, key, _report(future))
                 del running[future]

@@ -10,6 +10,7 @@ from typing import Any
 from torchdeform import __version__
 from torchdeform.cohort.plan import Failure, Job
 from torchdeform.cohort.task import DONE, FAILED, FIGURES, PairReport
+from torchdeform.io.files import atomic_folder
 
 SUMMARY, FAILURES, PAGE = "summary.csv", "failures.csv", "index.html"
 WAITING = "waiting"
@@ -94,17 +95,14 @@ def _failure_row(failure: Failure, out: Path) -> Row:
 
 def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
     """Write a table that appears complete or not at all."""
-    part = path.with_name(f".{path.name}.part")
-    with part.open("w", encoding="utf-8", newline="") as file:
+    with atomic_folder(path.parent) as folder, (folder / path.name).open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    part.replace(path)
 
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _SHOWN = ("report.html", "overview.png")  # the first that exists is linked from the name of a pair
-_STATUSES = ("done", "failed", "waiting")
 
 
 def write_page(path: Path, rows: Sequence[Row], failures: Iterable[Failure]) -> None:
@@ -124,14 +122,12 @@ def write_page(path: Path, rows: Sequence[Row], failures: Iterable[Failure]) -> 
     text = environment.get_template(path.name).stream(
         columns=[column for column in _columns(rows) if column not in ("name", "status", "folder")],
         rows=({"cells": row, "link": _link(path.parent, row), **_trouble(path.parent, row, why)} for row in rows),
-        counts={status: statuses.count(status) for status in _STATUSES},
+        counts={status: statuses.count(status) for status in (DONE, FAILED, WAITING)},
         title=path.absolute().parent.name,
         version=__version__,
     )
-    part = path.with_name(f".{path.name}.part")
-    with part.open("w", encoding="utf-8") as file:
+    with atomic_folder(path.parent) as folder, (folder / path.name).open("w", encoding="utf-8") as file:
         file.writelines(text)
-    part.replace(path)
 
 
 def _columns(rows: Sequence[Row]) -> list[str]:
@@ -147,7 +143,7 @@ def _link(folder: Path, row: Row) -> str:
 
 
 def _trouble(folder: Path, row: Row, why: Mapping[str, Failure]) -> dict[str, Any]:
-    failure = why.get(str(row["name"])) if row["status"] == "failed" else None
+    failure = why.get(str(row["name"])) if row["status"] == FAILED else None
     if failure is None:
         return {"sentence": "", "log": ""}
     log = failure.log

@@ -26,7 +26,7 @@ from torchdeform.io.labels import read_labels, write_labels
 from torchdeform.pipeline.register import PairFiles, choose_device
 from torchdeform.registration.template import Lazy, Template, identity_map, make_template
 from torchdeform.report.figures import write_gallery
-from torchdeform.report.record import versions, write_json
+from torchdeform.report.record import describe_map, versions, write_json
 
 TEMPLATE, OVERVIEW, RECORD = "template.nii.gz", "overview.png", "result.json"
 SUBJECTS, ROUNDS = "subjects", "rounds"
@@ -254,12 +254,7 @@ def _publish_subject(subject: Subject, from_template: Transform, template: Templ
 def _describe_map(map_: Transform) -> dict[str, Any]:
     """Return folds and determinants of a map from the template, without its affine part."""
     back, ahead = (stage.field for stage in map_.stages if isinstance(stage, Displacement))
-    diagnosis = diagnose(compose(ahead.data, back.data, back.grid), back.grid)
-    return {
-        "folds": int(diagnosis.folds.item()),
-        "determinant_min": diagnosis.det_min.item(),
-        "determinant_max": diagnosis.det_max.item(),
-    }
+    return describe_map(diagnose(compose(ahead.data, back.data, back.grid), back.grid))
 
 
 def _recorded(path: Path, key: str) -> dict[str, Any] | None:

@@ -98,9 +98,9 @@ def repair_folds(u: Tensor, grid: Grid, floor: float = 0.0) -> Tensor:
             return u
         if step == 0 and not bool(u.isfinite().all()):
             raise ComputationError("the map is not finite; check the images for extreme values, or take smaller steps")
-        wider = _WIDEN[grid.dim](folded.to(u.dtype), 5, stride=1, padding=2)
+        wider = _WIDEN[grid.dim](folded.to(u.dtype), 3, stride=1, padding=1)
         share = torch.maximum(share, wider)
-        fading = neighbour_mean(neighbour_mean(share))
+        fading = neighbour_mean(share)
         u = keep_faces(torch.lerp(u, neighbour_mean(u), fading.expand_as(u)), u, grid)
     raise ComputationError(
         f"the map still folds after {_ROUNDS} rounds of smoothing: it varies too much for this grid; take smoother "

@@ -9,6 +9,9 @@ from torchdeform.fem.system import DivCurlSystem
 from torchdeform.solvers.base import LinearSolver
 from torchdeform.solvers.cg import ConjugateGradient, Jacobi
 
+# A matrix of more entries (see `DivCurlSystem.matrix_entries`) is not assembled: that would take more than 6 GB.
+LARGEST_MATRIX = 2**26
+
 Method = Literal["auto", "transform", "cg", "assembled"]
 Preconditioner = Literal["transform", "jacobi", "none"]
 
@@ -20,7 +23,7 @@ class SolverSettings:
     Args:
         method: ``transform`` (direct, by fast sine and cosine transforms, where they are exact), ``cg`` (batched
             conjugate gradients without a stored matrix), ``assembled`` (the same with the matrix, assembled as torch
-            sparse COO), or ``auto``: ``transform`` where it is exact, else ``cg``. All have the same answer.
+            sparse COO, up to 1.8 million nodes in 2D and 270,000 in 3D; beyond, without it), or ``auto``: ``transform`` where it is exact, else ``cg``. All have the same answer.
         preconditioner: of conjugate gradients: ``transform`` (the direct solver with mean weights; where it is exact
             one step is enough), ``jacobi`` (the diagonal), ``none``.
         rtol: solved when ‖load − K v‖ ≤ max(rtol ‖load‖, atol). None asks for 1e-5 in float32 and 1e-10 in float64.
@@ -55,7 +58,7 @@ def solver_of(settings: SolverSettings | Method, system: DivCurlSystem) -> Linea
         return FastTransform(rtol=how.rtol, atol=how.atol)
     preconditioners = {"transform": FastTransform(approximate=True), "jacobi": Jacobi(), "none": None}
     return ConjugateGradient(
-        assembled=how.method == "assembled",
+        assembled=how.method == "assembled" and system.matrix_entries <= LARGEST_MATRIX,
         preconditioner=preconditioners[how.preconditioner],
         rtol=how.rtol,
         atol=how.atol,

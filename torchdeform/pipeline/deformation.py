@@ -30,7 +30,7 @@ from torchdeform.io import read_displacement, read_image, write_displacement, wr
 from torchdeform.io.files import atomic_folder, require_writable
 from torchdeform.io.images import ending_like, read_optional
 from torchdeform.report.grids import write_grids
-from torchdeform.report.record import versions, write_json
+from torchdeform.report.record import describe_map, versions, write_json
 from torchdeform.report.report_data import grey, to_unit
 from torchdeform.solvers.base import Status
 
@@ -245,14 +245,11 @@ def _background(image: Image) -> Tensor | None:
 
 def _described(source: Path, u: Tensor, grid: Grid) -> Record:
     """Return what the records of all three commands have in common."""
-    diagnosis = diagnose(u, grid)
     return {
         "source": str(source),
         "size": grid.shape[::-1],
         "spacing": grid.spacing[::-1],
-        "folds": int(diagnosis.folds.item()),
-        "determinant_min": diagnosis.det_min.item(),
-        "determinant_max": diagnosis.det_max.item(),
+        **describe_map(diagnose(u, grid)),
         "displacement_max_voxels": voxels(u, grid).max().item(),
         "versions": versions(),
     }
