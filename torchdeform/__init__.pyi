@@ -43,12 +43,16 @@ from .io import (
 )
 from .metrics.evaluation import Evaluation, Measures, dice, hausdorff
 from .pipeline.config import load_settings
-from .registration.affine.align import Alignment, AlignmentSettings, align
+from .registration.affine.align import Alignment, align
+from .registration.affine.settings import AlignmentSettings
 from .registration.deformable import register
-from .registration.discrete import DiscreteSettings, discrete_start
+from .registration.discrete import discrete_start
 from .registration.problem import Guidance
 from .registration.result import RegistrationResult
-from .registration.settings import RegistrationSettings
+from .registration.settings import (
+    DiscreteSettings,
+    RegistrationSettings,
+)
 from .solvers.base import Solution, Status
 
 __version__: str

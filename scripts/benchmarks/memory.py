@@ -1,4 +1,4 @@
-"""Peak memory of registrations from files to files, beside what `torchdeform.pipeline.memory.estimate` says.
+"""Peak memory of registrations from files to files, beside what `torchdeform.pipeline.memory.footprint` says.
 
 Each case runs in a process of its own: python scripts/benchmarks/memory.py [--quick]
 """
@@ -10,21 +10,35 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# Dimension, voxels along an axis, channels, similarity, start.
-QUICK = ((2, 512, 1, "lncc", "identity"), (3, 64, 1, "lncc", "identity"), (3, 96, 1, "ssd", "discrete"))
+# Dimension, voxels along an axis, channels, settings.
+QUICK = (
+    (2, 512, 1, "similarity=lncc"),
+    (3, 64, 1, "similarity=lncc"),
+    (3, 96, 1, "similarity=ssd", "start=discrete"),
+    (3, 96, 1, "similarity=lncc", "symmetric=true"),
+)
 CASES = (
-    *((2, n, 1, "lncc", "identity") for n in (512, 1024, 2048, 4096)),
-    *((2, 1024, c, s, "identity") for c, s in ((1, "ssd"), (1, "mi"), (1, "ngf"), (1, "mind"), (3, "lncc"))),
-    *((3, n, 1, "lncc", "identity") for n in (64, 96, 128, 160, 256)),
-    *((3, 96, c, s, "identity") for c, s in ((1, "ssd"), (1, "ncc"), (1, "mi"), (1, "ngf"), (1, "mind"), (3, "lncc"))),
-    *((2, n, 1, "lncc", "discrete") for n in (512, 1024, 1536)),
-    *((3, n, c, s, "discrete") for n, c, s in ((64, 1, "lncc"), (96, 1, "ssd"), (96, 3, "lncc"), (128, 1, "lncc"))),
+    *((2, n, 1, "similarity=lncc") for n in (512, 1024, 2048, 4096)),
+    *((2, 1024, 1, f"similarity={s}") for s in ("ssd", "mi", "ngf", "mind")),
+    (2, 1024, 3, "similarity=lncc"),
+    *((3, n, 1, "similarity=lncc") for n in (64, 96, 128, 160, 256)),
+    *((3, 96, 1, f"similarity={s}") for s in ("ssd", "ncc", "mi", "ngf", "mind")),
+    (3, 96, 3, "similarity=lncc"),
+    *((2, n, 1, "similarity=lncc", "start=discrete") for n in (512, 1024, 1536)),
+    *((3, n, 1, "similarity=lncc", "start=discrete") for n in (64, 128)),
+    (3, 96, 1, "similarity=ssd", "start=discrete"),
+    (3, 96, 3, "similarity=lncc", "start=discrete"),
+    *((2, n, 1, "similarity=lncc", "symmetric=true") for n in (512, 1024, 2048)),
+    *((3, n, 1, "similarity=lncc", "symmetric=true") for n in (64, 96, 128, 160)),
+    *((3, 96, 1, f"similarity={s}", "symmetric=true") for s in ("ssd", "mi", "ngf", "mind")),
+    (3, 96, 3, "similarity=lncc", "symmetric=true"),
 )
 
-Case = tuple[int, int, int, str, str]
+Case = tuple[Any, ...]
 
 
 def run(case: Case) -> int:
@@ -36,14 +50,14 @@ def run(case: Case) -> int:
     from torchdeform.core.grid import Grid
     from torchdeform.core.image import Image
     from torchdeform.io import write_image
+    from torchdeform.pipeline.memory import peak
 
-    dim, n, channels, similarity, start = case
+    dim, n, channels, *settings = case
     torch.manual_seed(0)
     coarse = torch.rand(1, channels, *[n // 8] * dim)
     mode = {2: "bilinear", 3: "trilinear"}[dim]
     data = torch.nn.functional.interpolate(coarse, size=(n,) * dim, mode=mode)
-    settings = ("steps=[1, 1, 2]", f"similarity={similarity}", f"start={start}")
-    choices = (*(word for setting in settings for word in ("--set", setting)), "--device", "cpu", "--quiet")
+    choices = ["--device=cpu", "--quiet", *(f"--set={setting}" for setting in ("steps=[1, 1, 2]", *settings))]
     with tempfile.TemporaryDirectory() as folder:
         names = [Path(folder) / f"{name}.nrrd" for name in ("fixed", "moving")]
         for name, shift in zip(names, (0, 1), strict=True):
@@ -51,13 +65,7 @@ def run(case: Case) -> int:
         del data
         if register([*map(str, names), "--out", f"{folder}/out", *choices]):
             raise SystemExit(f"{case} could not be registered")
-    return _peak()
-
-
-def _peak() -> int:
-    """Return the peak of this process in bytes; getrusage would count its parent's, whose memory it was forked from."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) * 1024
+    return peak() or 0
 
 
 def measure(case: Case) -> int:
@@ -71,10 +79,11 @@ def measure(case: Case) -> int:
 def estimated(case: Case) -> int:
     """Return what the package expects of a case, in bytes."""
     from torchdeform.core.grid import Grid
-    from torchdeform.pipeline.memory import estimate
+    from torchdeform.pipeline.config import load_settings, parse_override
+    from torchdeform.pipeline.memory import footprint
 
-    dim, n, channels, similarity, start = case
-    return estimate(Grid((n,) * dim), channels=channels, similarity=similarity, start=start)
+    dim, n, channels, *settings = case
+    return footprint(Grid((n,) * dim), channels, load_settings(overrides=dict(map(parse_override, settings))))
 
 
 def main() -> None:
@@ -88,7 +97,7 @@ def main() -> None:
         return
     for case in QUICK if arguments.quick else CASES:
         found, expected = measure(case), estimated(case)
-        print(f"{case!s:38} measured {found / 1e6:8.1f} MB  expected {expected / 1e6:8.1f} MB  {expected / found:.2f}")
+        print(f"{case!s:60} measured {found / 1e6:8.1f} MB  expected {expected / 1e6:8.1f} MB  {expected / found:.2f}")
 
 
 if __name__ == "__main__":

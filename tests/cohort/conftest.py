@@ -4,12 +4,12 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
+from nested_settings import settings_of
 
 from torchdeform.cohort.plan import Job
 from torchdeform.cohort.schema import Cohort, read_cohort
 from torchdeform.io import write_image
 from torchdeform.pipeline.register import PairFiles
-from torchdeform.registration.settings import RegistrationSettings
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def cohort_of(tmp_path) -> Callable[[str], Cohort]:
     return read
 
 
-FAST = RegistrationSettings(align="none", similarity="ssd", steps=(2,), length=8.0)
+FAST = settings_of(align="none", similarity="ssd", steps=(2,), length_scale=8.0)
 
 
 @pytest.fixture

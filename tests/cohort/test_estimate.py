@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from nested_settings import changed
 
 from torchdeform.cohort.estimate import Costs, estimate, measure
 from torchdeform.cohort.plan import Job
@@ -11,17 +12,18 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.io import write_image
 from torchdeform.pipeline.config import load_settings
+from torchdeform.pipeline.memory import footprint
 from torchdeform.pipeline.register import PairFiles
 
 
 def test_needs_are_those_of_the_estimate(jobs, tmp_path):
     volume = tmp_path / "missing.nii.gz"
     unknown = replace(jobs[0], files=replace(jobs[0].files, fixed=volume))
-    symmetric = replace(jobs[0], settings=replace(jobs[0].settings, symmetric=True))
+    symmetric = replace(jobs[0], settings=changed(jobs[0].settings, symmetric=True))
     small, limited = replace(jobs[0], memory=10**12), replace(unknown, memory=5)
     one, two, none, same, five = measure([jobs[0], symmetric, unknown, small, limited])
     assert one == same > 4e8
-    assert two == 2 * one
+    assert two == footprint(Grid((16, 16)), 1, symmetric.settings) > one
     assert (none, five) == (0, 5)
 
 
@@ -45,6 +47,18 @@ def test_costs_grow_with_size_steps_and_number(tmp_path):
     assert estimate([tight]).seconds < two.seconds
     assert estimate([tight]).memory <= 480_000_000
     assert (estimate([refused]).seconds, estimate([refused]).unknown) == (0, 1)
+
+
+def test_a_limit_of_memory_coarsens_what_takes_more(tmp_path):
+    plain, discrete, both = (
+        _job(tmp_path, (64, 64, 64), memory=490_000_000, settings={"similarity": "ncc"} | some)
+        for some in ({}, {"start": "discrete"}, {"symmetric": True})
+    )
+    free = replace(both, memory=None)
+    assert estimate([discrete]).seconds < estimate([plain]).seconds
+    assert estimate([both]).seconds < estimate([free]).seconds
+    assert estimate([replace(both, memory=footprint(Grid((64, 64, 64)), 1, both.settings))]) == estimate([free])
+    assert estimate([both]).memory == 490_000_000
 
 
 def test_costs_of_files_that_say_nothing_are_unknown(tmp_path):

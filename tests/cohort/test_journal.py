@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from nested_settings import changed
 
 from torchdeform.cohort.journal import JOURNAL, Journal, Record
 from torchdeform.cohort.plan import Job
@@ -105,7 +106,7 @@ def test_the_print_depends_on_content_not_on_paths_or_dates(tmp_path, job):
 @pytest.mark.parametrize(
     "change",
     [
-        lambda job: replace(job, settings=replace(job.settings, window=7)),
+        lambda job: replace(job, settings=changed(job.settings, window=7)),
         lambda job: replace(job, device="cpu"),
         lambda job: replace(job, memory=10**9),
         lambda job: replace(job, voxels=True),

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from torchdeform.cohort.learn2reg import submission_name
-from torchdeform.cohort.pairs import entries
+from torchdeform.cohort.pairs import pair_specs
 from torchdeform.errors import InputError
 
 
@@ -25,7 +25,7 @@ def _dataset(folder, **content):
 
 def test_learn2reg_pairs_with_what_both_images_have(cohort_of, tmp_path):
     _dataset(tmp_path)
-    found = entries(cohort_of("pairs: {learn2reg: {file: Lung_dataset.json}}\n"))
+    found = pair_specs(cohort_of("pairs: {learn2reg: {file: Lung_dataset.json}}\n"))
     assert len(found) == 2
     assert found[0].files == {
         "fixed": tmp_path / "imagesTr/Lung_0001_0000.nii.gz",
@@ -35,7 +35,7 @@ def test_learn2reg_pairs_with_what_both_images_have(cohort_of, tmp_path):
         "fixed_points": tmp_path / "landmarkssTr/Lung_0001_0000",
         "moving_points": tmp_path / "l1",
     }
-    assert len(entries(cohort_of("pairs: {learn2reg: {file: Lung_dataset.json, split: train}}\n"))) == 1
+    assert len(pair_specs(cohort_of("pairs: {learn2reg: {file: Lung_dataset.json, split: train}}\n"))) == 1
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_learn2reg_pairs_with_what_both_images_have(cohort_of, tmp_path):
 def test_wrong_data_sets(cohort_of, tmp_path, content, sentence):
     _dataset(tmp_path, **content)
     with pytest.raises(InputError, match=sentence):
-        entries(cohort_of("pairs: {learn2reg: {file: Lung_dataset.json}}\n"))
+        pair_specs(cohort_of("pairs: {learn2reg: {file: Lung_dataset.json}}\n"))
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_files_that_are_no_data_set(cohort_of, tmp_path, text, sentence):
     if text is not None:
         (tmp_path / "d.json").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=sentence):
-        entries(cohort_of("pairs: {learn2reg: {file: d.json}}\n"))
+        pair_specs(cohort_of("pairs: {learn2reg: {file: d.json}}\n"))
 
 
 @pytest.mark.parametrize(

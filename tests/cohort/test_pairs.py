@@ -5,7 +5,7 @@ import re
 import pytest
 from cohort_files import BIDS
 
-from torchdeform.cohort.pairs import entries, find_images, named_images
+from torchdeform.cohort.pairs import find_images, named_images, pair_specs
 from torchdeform.errors import InputError
 
 _FILES = "'sub-{subject}/ses-{session}/anat/*_T1w.nii.gz'"
@@ -13,7 +13,7 @@ _FILES = "'sub-{subject}/ses-{session}/anat/*_T1w.nii.gz'"
 
 def _pairs(found):
     """Return (fixed, moving) by the names of the files, in order."""
-    return [(entry.files["fixed"].name, entry.files["moving"].name) for entry in found]
+    return [(pair.files["fixed"].name, pair.files["moving"].name) for pair in found]
 
 
 def _session(number, subject="01"):
@@ -27,7 +27,7 @@ def _table(folder, text, name="pairs.csv"):
 
 def test_consecutive_sessions_within_each_subject(touch, cohort_of):
     touch(BIDS)
-    found = entries(cohort_of(f"pairs: {{pattern: {{files: {_FILES}, pairing: consecutive, within: [subject]}}}}\n"))
+    found = pair_specs(cohort_of(f"pairs: {{pattern: {{files: {_FILES}, pairing: consecutive, within: [subject]}}}}\n"))
     assert _pairs(found) == [(_session(a, s), _session(b, s)) for s in ("01", "02") for a, b in ((1, 2), (2, 10))]
     assert found[0].name == "sub-01_from-ses2_to-ses1"
     assert found[0].subject == "sub-01"
@@ -36,21 +36,21 @@ def test_consecutive_sessions_within_each_subject(touch, cohort_of):
 def test_order_is_that_of_a_part(touch, cohort_of):
     touch(["a_3.png", "b_2.png", "c_10.png"])
     text = "pairs: {pattern: {files: '{who}_{visit}.png', pairing: consecutive, order: visit}}\n"
-    assert _pairs(entries(cohort_of(text))) == [("b_2.png", "a_3.png"), ("a_3.png", "c_10.png")]
+    assert _pairs(pair_specs(cohort_of(text))) == [("b_2.png", "a_3.png"), ("a_3.png", "c_10.png")]
 
 
 @pytest.mark.parametrize(("both", "count"), [("false", 3), ("true", 6)])
 def test_every_two(touch, cohort_of, both, count):
     touch(["1.png", "2.png", "3.png"])
-    found = entries(cohort_of(f"pairs: {{pattern: {{files: '{{n}}.png', pairing: all, both_ways: {both}}}}}\n"))
-    assert len(set(_pairs(found))) == len({entry.name for entry in found}) == count
+    found = pair_specs(cohort_of(f"pairs: {{pattern: {{files: '{{n}}.png', pairing: all, both_ways: {both}}}}}\n"))
+    assert len(set(_pairs(found))) == len({pair.name for pair in found}) == count
     assert _pairs(found)[0] == ("1.png", "2.png")
 
 
 def test_each_to_a_member_of_its_group(touch, cohort_of):
     touch([*BIDS, "sub-03/ses-2/anat/sub-03_ses-2_T1w.nii.gz"])
     text = f"files: {_FILES}, pairing: group, within: [subject], reference: {{session: '1'}}"
-    *found, lonely = entries(cohort_of(f"pairs: {{pattern: {{{text}}}}}\n"))
+    *found, lonely = pair_specs(cohort_of(f"pairs: {{pattern: {{{text}}}}}\n"))
     assert _pairs(found) == [(_session(1, s), _session(k, s)) for s in ("01", "02") for k in (2, 10)]
     assert (lonely.name, lonely.files) == ("sub-03", {})
     assert "0 of its 1 images have session 1, and one must" in lonely.problem
@@ -59,7 +59,7 @@ def test_each_to_a_member_of_its_group(touch, cohort_of):
 def test_all_to_a_template_but_itself(touch, cohort_of):
     touch(["1.png", "2.png", "3.png", "labels/1.tif", "labels/3.tif", "mask.png"])
     text = "files: '{n}.png', parts: {n: '[0-9]'}, pairing: template, fixed: 2.png, fixed_mask: mask.png"
-    found = entries(cohort_of(f"pairs: {{pattern: {{{text}, labels: 'labels/{{n}}.tif', fixed_labels: l.tif}}}}\n"))
+    found = pair_specs(cohort_of(f"pairs: {{pattern: {{{text}, labels: 'labels/{{n}}.tif', fixed_labels: l.tif}}}}\n"))
     assert _pairs(found) == [("2.png", "1.png"), ("2.png", "3.png")]
     assert {key: path.name for key, path in found[1].files.items()} == {
         "fixed": "2.png", "fixed_labels": "l.tif", "fixed_mask": "mask.png",
@@ -71,15 +71,15 @@ def test_all_to_a_template_but_itself(touch, cohort_of):
 def test_a_template_of_each_subject(touch, cohort_of):
     touch(BIDS)
     text = f"files: {_FILES}, pairing: template, fixed: 'sub-{{subject}}/base.nii.gz'"
-    found = entries(cohort_of(f"pairs: {{pattern: {{{text}}}}}\n"))
-    assert {entry.files["fixed"].parent.name for entry in found} == {"sub-01", "sub-02"}
+    found = pair_specs(cohort_of(f"pairs: {{pattern: {{{text}}}}}\n"))
+    assert {pair.files["fixed"].parent.name for pair in found} == {"sub-01", "sub-02"}
     assert found[2].name == "sub-01_ses-10"
 
 
 def test_what_goes_along_is_no_image_of_its_own(touch, cohort_of):
     touch(["s1.png", "s1_label.png", "s2.png", "s2_label.png", "s1_m1.png", "s2_m1.png", "s1.csv", "s2.csv"])
     text = "files: 's{n}.png', labels: 's{n}_label.png', masks: 's{n}_m*.png', points: 's{n}.csv', pairing: all"
-    (found,) = entries(cohort_of(f"pairs: {{pattern: {{{text}}}}}\n"))
+    (found,) = pair_specs(cohort_of(f"pairs: {{pattern: {{{text}}}}}\n"))
     assert {key: path.name for key, path in found.files.items()} == {
         "fixed": "s1.png", "fixed_labels": "s1_label.png", "fixed_mask": "s1_m1.png", "fixed_points": "s1.csv",
         "moving": "s2.png", "moving_labels": "s2_label.png", "moving_mask": "s2_m1.png", "moving_points": "s2.csv",
@@ -88,26 +88,26 @@ def test_what_goes_along_is_no_image_of_its_own(touch, cohort_of):
 
 def test_a_mask_that_cannot_be_told_is_a_problem_of_its_pair(touch, cohort_of):
     touch(["1.png", "2.png", "3.png", "m1a.tif", "m2a.tif", "m2b.tif", "m3a.tif"])
-    found = entries(cohort_of("pairs: {pattern: {files: '{n}.png', masks: 'm{n}*.tif', pairing: all}}\n"))
-    assert [bool(entry.problem) for entry in found] == [True, False, True]
+    found = pair_specs(cohort_of("pairs: {pattern: {files: '{n}.png', masks: 'm{n}*.tif', pairing: all}}\n"))
+    assert [bool(pair.problem) for pair in found] == [True, False, True]
     assert "m2*.tif must match one file, and 2 files match" in found[0].problem
 
 
 def test_a_regular_expression_finds_images_too(touch, cohort_of):
     touch(["x/p1/pre.png", "x/p1/post.png", "x/p2/post.png", "x/p2/pre.png", "x/p2/other.png"])
     text = "expression: 'p(?P<subject>[0-9])/(?P<phase>pre|post)\\.png', folder: x, pairing: group"
-    found = entries(cohort_of(f"pairs: {{pattern: {{{text}, within: [subject], reference: {{phase: pre}}}}}}\n"))
+    found = pair_specs(cohort_of(f"pairs: {{pattern: {{{text}, within: [subject], reference: {{phase: pre}}}}}}\n"))
     assert _pairs(found) == [("pre.png", "post.png")] * 2
     assert found[0].name == "sub-1_from-phasepost_to-phasepre"
 
 
 def test_nothing_found_is_refused(cohort_of):
     with pytest.raises(InputError, match=r"no file matches .*/nothing"):
-        entries(cohort_of("pairs: {pattern: {files: 'nothing*.png', pairing: all}}\n"))
+        pair_specs(cohort_of("pairs: {pattern: {files: 'nothing*.png', pairing: all}}\n"))
     with pytest.raises(InputError, match="names no pairs"):
-        entries(cohort_of("device: cpu\n"))
+        pair_specs(cohort_of("device: cpu\n"))
     with pytest.raises(InputError, match="comes to no pair at all"):
-        entries(cohort_of("pairs: {list: []}\n"))
+        pair_specs(cohort_of("pairs: {list: []}\n"))
 
 
 def test_several_patterns_and_plain_files(touch, cohort_of):
@@ -118,7 +118,7 @@ def test_several_patterns_and_plain_files(touch, cohort_of):
 
 def test_listed_pairs_keep_their_order_and_names(cohort_of):
     text = "pairs:\n  list:\n    - {fixed: x/a.nii.gz, moving: b.mha, moving_mask: m.png}\n"
-    first, second = entries(
+    first, second = pair_specs(
         cohort_of(text + "    - {name: other, fixed: a.png, moving: b.png, settings: {window: 5}}\n")
     )
     assert (first.name, second.name) == ("from-b_to-a", "other")
@@ -136,7 +136,7 @@ def test_tables(cohort_of, tmp_path, monkeypatch, name, separator):
         ["", "", "", "", "", ""],
     ]
     text = "\n".join(separator.join(row) for row in rows).replace("[5  10]", '"[5, 10]"')
-    first, second = entries(cohort_of(_table(tmp_path, f"\ufeff{text}\n", name)))
+    first, second = pair_specs(cohort_of(_table(tmp_path, f"\ufeff{text}\n", name)))
     assert first.files == {"fixed": tmp_path / "a.png", "moving": type(tmp_path)("/data/b.png")}
     assert first.settings == {"window": 7, "steps": [5, 10]}
     assert (first.name, second.name, second.settings) == ("one", "from-c_to-a", {})
@@ -162,17 +162,17 @@ def test_tables(cohort_of, tmp_path, monkeypatch, name, separator):
 )
 def test_wrong_tables(cohort_of, tmp_path, text, sentence):
     with pytest.raises(InputError, match=re.escape(sentence)):
-        entries(cohort_of(_table(tmp_path, text)))
+        pair_specs(cohort_of(_table(tmp_path, text)))
 
 
 def test_files_that_are_no_table(cohort_of, tmp_path):
     with pytest.raises(InputError, match="No such file"):
-        entries(cohort_of("pairs: {table: {file: no.csv}}\n"))
+        pair_specs(cohort_of("pairs: {table: {file: no.csv}}\n"))
     with pytest.raises(InputError, match="the ending of a table"):
-        entries(cohort_of("pairs: {table: {file: no.xlsx}}\n"))
+        pair_specs(cohort_of("pairs: {table: {file: no.xlsx}}\n"))
     (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="is no text"):
-        entries(cohort_of("pairs: {table: {file: binary.csv}}\n"))
+        pair_specs(cohort_of("pairs: {table: {file: binary.csv}}\n"))
 
 
 def test_images_of_a_template_are_named(touch, cohort_of):

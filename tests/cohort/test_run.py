@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from nested_settings import changed
 
 from torchdeform.cohort.executors.local import Engine
 from torchdeform.cohort.executors.worker import EngineError, TimeLimit, WorkerLost
@@ -107,7 +108,7 @@ def test_what_changed_is_done_again(engine, jobs, out):
     run(jobs, out, EngineSettings())
     engine.ran.clear()
     jobs[1].files.moving.write_text("another", encoding="ascii")
-    jobs[2] = replace(jobs[2], settings=replace(jobs[2].settings, window=7))
+    jobs[2] = replace(jobs[2], settings=changed(jobs[2].settings, window=7))
     (jobs[3].files.out / "warped.png").unlink()
     assert run(jobs, out, EngineSettings()).done == 5
     assert engine.ran == ["b", "c", "d"]

@@ -258,7 +258,7 @@ def test_points_and_parameters_get_gradients():
 def test_wrong_input_is_refused():
     grid = Grid((4, 5))
     v = torch.zeros(1, 2, 4, 5)
-    with pytest.raises(InputError, match="method must be one of euler, midpoint, rk4, dopri5, got 'rk5'"):
+    with pytest.raises(InputError, match="method must be one of euler, midpoint, rk4, dopri5, squaring, got 'rk5'"):
         integrate(v, grid, method="rk5")
     for steps in (0, -1, 2.5):
         with pytest.raises(InputError, match="steps must be a whole number, at least 1"):
@@ -270,6 +270,10 @@ def test_wrong_input_is_refused():
         integrate(v, grid, time=math.inf)
     with pytest.raises(InputError, match="integrate: v must have shape"):
         integrate(v[:, :1], grid)
+    with pytest.raises(InputError, match="squaring has no adjoint"):
+        integrate(v, grid, method="squaring", adjoint=True)
+    with pytest.raises(InputError, match="squaring follows a stationary velocity"):
+        integrate_points(lambda _, p: p, grid.points(), (0, 1), grid, OdeSolver(method="squaring"))
     for times in ([0.0], [0.0, 1.0, 0.5], [1.0, 1.0]):
         with pytest.raises(InputError, match="times must be two or more, increasing or decreasing"):
             integrate_points(lambda _, p: p, grid.points(), times, grid)

@@ -5,10 +5,10 @@ import torch
 from pairs import SETS, Pair
 
 from torchdeform.core.image import Image, luminance
-from torchdeform.core.transform import Affine
+from torchdeform.core.transform import Affine, Transform
 from torchdeform.io import read_image
 from torchdeform.io.points import matched, read_points
-from torchdeform.registration.affine.align import Alignment, affine_warp, align
+from torchdeform.registration.affine.align import Alignment, align
 
 pytestmark = pytest.mark.data
 
@@ -29,7 +29,7 @@ def dice(pair: Pair, affine: Affine) -> float:
     assert pair.fixed_labels is not None
     assert pair.moving_labels is not None
     fixed, moving = (luminance(read_image(path)) for path in (pair.fixed_labels, pair.moving_labels))
-    there = affine_warp(moving, fixed, affine, mode="nearest")
+    there = Transform((affine,)).image(moving, fixed, mode="nearest").data
     common = set(fixed.data.unique().tolist()) & set(moving.data.unique().tolist()) - {0.0}
     both = [(fixed.data == label, there == label) for label in common]
     return sum(2 * float((a & b).sum()) / float(a.sum() + b.sum()) for a, b in both) / len(both)

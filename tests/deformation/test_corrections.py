@@ -10,9 +10,10 @@ from torch.autograd import gradcheck
 
 from torchdeform.core.derivatives import jacobian_determinant
 from torchdeform.core.diagnostics import diagnose
+from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid
 from torchdeform.deformation import versions
-from torchdeform.deformation.corrections import correct_determinant, remove_folds
+from torchdeform.deformation.corrections import correct_determinant
 from torchdeform.deformation.monitors import MonitorSettings, mean_value, ring_monitor
 from torchdeform.deformation.versions import DeformationSettings, grid_from_initial_monitor
 from torchdeform.errors import ComputationError
@@ -28,36 +29,6 @@ def stays_on_faces(u: Tensor) -> bool:
 def ring(grid: Grid, f_min: float, width: float) -> Tensor:
     centre = [side / 2 for side in grid.extent]
     return ring_monitor(grid, centre, 0.3 * grid.extent[0], width, MonitorSettings(f_min=f_min, dtype=torch.float64))
-
-
-def test_folds_are_removed_where_they_are_and_nowhere_else():
-    grid = Grid((40, 40))
-    u = torch.zeros(2, 2, 40, 40, dtype=torch.float64)
-    u[0, 0, 20, 20] = 3.0
-    assert diagnose(u, grid).folds.tolist()[0] > 0
-    clean = remove_folds(u, grid)
-    assert diagnose(clean, grid).diffeomorphic.all()
-    assert torch.equal(clean[1], u[1])
-    assert not clean[0, :, :10].any()
-    assert not clean[0, :, :, 30:].any()
-    assert stays_on_faces(clean)
-
-
-@pytest.mark.parametrize("grid", [Grid((9, 12), (0.5, 1.0)), Grid((7, 6, 8), (1.0, 0.5, 2.0))])
-def test_any_displacement_is_unfolded(grid):
-    u = torch.randn(1, grid.dim, *grid.shape, dtype=torch.float64, generator=torch.manual_seed(0)) * 3
-    for k in range(grid.dim):
-        for end in (0, -1):
-            u[:, k].select(k + 1, end).zero_()
-    clean = remove_folds(u, grid)
-    assert diagnose(clean, grid).diffeomorphic.all()
-    assert stays_on_faces(clean)
-
-
-def test_folds_that_stay_are_an_error():
-    grid = Grid((6, 6))
-    with pytest.raises(ComputationError, match="still folds after 1000 rounds"):
-        remove_folds(torch.full((1, 2, 6, 6), math.nan), grid)
 
 
 def test_a_flow_that_is_not_finite_is_an_error(monkeypatch):
@@ -100,4 +71,4 @@ def test_gradients():
     bent = moved(inner).detach()
     bent[0, 0, 3, 3] = 0.8
     assert not diagnose(bent, grid).diffeomorphic.all()
-    assert gradcheck(lambda u: remove_folds(u, grid), bent.requires_grad_())
+    assert gradcheck(lambda u: repair_folds(u, grid), bent.requires_grad_())

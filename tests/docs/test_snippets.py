@@ -7,13 +7,13 @@ import runpy
 import shlex
 import shutil
 import sys
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 import yaml
+from nested_settings import changed
 
 from torchdeform.cli.main import main, torchdeform
 from torchdeform.pipeline.config import load_settings
@@ -81,7 +81,7 @@ def quick(monkeypatch):
 
     def few(*arguments: object):
         settings = load_settings(*arguments)  # type: ignore[arg-type]
-        return replace(settings, steps=tuple(min(3, n) for n in settings.steps))
+        return changed(settings, steps=tuple(min(3, n) for n in settings.optimiser.steps))
 
     monkeypatch.setattr("torchdeform.cli.register.load_settings", few)
 

@@ -13,15 +13,16 @@ from torchdeform.core.derivatives import CURL_PAIRS
 from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.fem.boundary import Face, faces, fixed_unknowns
-from torchdeform.fem.div_curl import SolverSettings, curl_potential, solve_div_curl
+from torchdeform.fem.div_curl import curl_potential, solve_div_curl
 from torchdeform.fem.form import div_curl_form, gradient_form
 from torchdeform.fem.operator import assemble_load
 from torchdeform.fem.quadrature import adjoint, evaluate
+from torchdeform.fem.solver import SolverSettings
 from torchdeform.fem.weights import Weights
 from torchdeform.solvers.base import Status
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
-CG = SolverSettings(solver="cg")
+CG = SolverSettings(method="cg")
 
 
 def grid_on_unit_box(dim: int, cells: int) -> Grid:
@@ -77,7 +78,7 @@ def test_the_error_falls_with_the_square_of_the_spacing(boundary, field, weights
         grid = grid_on_unit_box(dim, n)
         v, div, curl = manufactured(field, grid)
         settings = SolverSettings(rtol=1e-9)
-        solution = solve_div_curl(div, curl, grid, boundary, boundary_values=v, weights=weights, settings=settings)
+        solution = solve_div_curl(div, curl, grid, boundary, boundary_values=v, weights=weights, solver=settings)
         assert solution.ok
         errors.append(l2(solution.value - v, grid))
     slopes = [
@@ -103,7 +104,7 @@ def test_it_solves_the_brute_force_system(brute, grid, settings, boundary):
         kinds,
         boundary_values=values,
         weights=Weights(*weights),
-        settings=replace(settings, rtol=1e-12),
+        solver=replace(settings, rtol=1e-12),
     )
     assert solution.ok
     oracle, fixed = brute(grid.shape, grid.spacing, points=2), fixed_unknowns(kinds, grid).flatten()
@@ -127,8 +128,8 @@ def test_it_solves_the_brute_force_system(brute, grid, settings, boundary):
 )
 def test_where_the_transform_is_exact_cg_needs_two_steps_with_it(grid, boundary, weights):
     div, curl = random_data(grid, batch=2)
-    settings = SolverSettings(solver="cg", rtol=1e-10)
-    solution = solve_div_curl(div, curl, grid, boundary, weights=weights, settings=settings)
+    settings = SolverSettings(method="cg", rtol=1e-10)
+    solution = solve_div_curl(div, curl, grid, boundary, weights=weights, solver=settings)
     assert solution.ok
     assert int(solution.steps.max()) <= 2
     direct = solve_div_curl(div, curl, grid, boundary, weights=weights)
@@ -152,7 +153,7 @@ def test_under_dirichlet_data_forty_steps_do_for_any_ratio_up_to_sixteen(grid, r
             "dirichlet",
             boundary_values=values,
             weights=Weights(ratio, 1.0),
-            settings=SolverSettings(rtol=1e-8),
+            solver=SolverSettings(rtol=1e-8),
         )
         assert solution.ok
         assert int(solution.steps) <= 40
@@ -166,9 +167,9 @@ def test_preconditioners_and_weights_by_element(preconditioner, boundary):
     varying = 0.5 + torch.rand(2, 1, 11, 8, dtype=torch.float64)
     weights = Weights(varying, 2.0, varying / 10)
     settings = SolverSettings(preconditioner=preconditioner, rtol=1e-11)
-    solution = solve_div_curl(div, curl, grid, boundary, weights=weights, settings=settings)
+    solution = solve_div_curl(div, curl, grid, boundary, weights=weights, solver=settings)
     assert solution.ok
-    other = solve_div_curl(div, curl, grid, boundary, weights=weights, settings=SolverSettings(rtol=1e-12))
+    other = solve_div_curl(div, curl, grid, boundary, weights=weights, solver=SolverSettings(rtol=1e-12))
     torch.testing.assert_close(solution.value, other.value, atol=1e-8, rtol=1e-8)
     if preconditioner != "transform":
         assert bool((solution.steps > other.steps).all())
@@ -176,7 +177,7 @@ def test_preconditioners_and_weights_by_element(preconditioner, boundary):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("boundary", ["slip", "dirichlet"])
-@pytest.mark.parametrize("settings", [SolverSettings(), CG, SolverSettings(solver="cg", preconditioner="jacobi")])
+@pytest.mark.parametrize("settings", [SolverSettings(), CG, SolverSettings(method="cg", preconditioner="jacobi")])
 def test_float32_comes_near_float64(settings, boundary, device):
     grid = Grid((20, 24), (1.0, 0.7))
     v, div, curl = manufactured(any_field, Grid(grid.shape, (0.05, 0.04)))
@@ -186,7 +187,7 @@ def test_float32_comes_near_float64(settings, boundary, device):
         grid,
         boundary,
         boundary_values=v.to(device).float(),
-        settings=settings,
+        solver=settings,
     )
     assert single.ok
     assert single.value.dtype == torch.float32
@@ -201,10 +202,10 @@ def test_smooth_data_on_a_fine_grid_in_float32_count_as_solved(settings):
     grid = Grid((257, 257))
     x = grid.points() * (math.pi / 256)
     div = x.cos().prod(dim=1, keepdim=True)
-    solution = solve_div_curl(div, None, grid, settings=settings)
+    solution = solve_div_curl(div, None, grid, solver=settings)
     assert solution.ok
     assert 1e-5 < float(solution.residual) < 5e-3
-    strict = solve_div_curl(div, None, grid, settings=replace(settings, rtol=1e-5))
+    strict = solve_div_curl(div, None, grid, solver=replace(settings, rtol=1e-5))
     assert strict.status == (Status.ROUNDING,)
     double = solve_div_curl(div.double(), None, grid)
     assert float((solution.value - double.value).abs().max() / double.value.abs().max()) < 1e-4
@@ -217,11 +218,11 @@ def test_a_batch_equals_its_items_one_by_one(settings, boundary):
     div, curl = random_data(grid, batch=4)
     values = torch.randn(4, 3, *grid.shape, dtype=torch.float64)
     div[1], curl[1], values[1], curl[2, 0, 3, 3, 3] = 0.0, 0.0, 0.0, math.nan
-    together = solve_div_curl(div, curl, grid, boundary, boundary_values=values, weights=weights, settings=settings)
+    together = solve_div_curl(div, curl, grid, boundary, boundary_values=values, weights=weights, solver=settings)
     for i in range(4):
         part = slice(i, i + 1)
         alone = solve_div_curl(
-            div[part], curl[part], grid, boundary, boundary_values=values[part], weights=weights, settings=settings
+            div[part], curl[part], grid, boundary, boundary_values=values[part], weights=weights, solver=settings
         )
         assert together.status[i] is alone.status[0]
         assert together.steps[i] == alone.steps[0]
@@ -276,19 +277,18 @@ def test_what_is_incompatible_is_taken_off_and_reported(dim):
 def test_theta_is_the_part_of_the_curl_that_is_none():
     grid = grid_on_unit_box(3, 16)
     v, div, curl = manufactured(slip_field, grid)
-    wanted = SolverSettings(theta=True)
-    plain = solve_div_curl(div, curl, grid, settings=wanted)
+    plain = solve_div_curl(div, curl, grid, theta=True)
     assert l2(plain.theta, grid) < 0.01 * l2(plain.value, grid)
     # Add the gradient of a potential that is zero on the boundary: θ finds it, and v does not notice.
     x = grid.points(dtype=torch.float64).requires_grad_()
     unit = x / grid.along(grid.extent, x)
     potential = torch.sin(math.pi * unit).prod(dim=1, keepdim=True)
     (gradient,) = torch.autograd.grad(potential.sum(), x)
-    solution = solve_div_curl(div, curl + gradient, grid, settings=wanted)
+    solution = solve_div_curl(div, curl + gradient, grid, theta=True)
     assert l2(solution.theta - plain.theta - potential.detach(), grid) < 0.01 * l2(potential.detach(), grid)
     assert l2(solution.value - plain.value, grid) < 0.01 * l2(v, grid)
     assert solve_div_curl(div, curl, grid).theta is None
-    assert not solve_div_curl(div, None, grid, settings=wanted).theta.any()
+    assert not solve_div_curl(div, None, grid, theta=True).theta.any()
 
 
 @pytest.mark.parametrize("boundary", ["slip", "dirichlet"])
@@ -310,7 +310,7 @@ def test_derivatives_by_data_and_boundary_values(grid, settings, boundary):
     inputs = tuple(t.requires_grad_() for t in (div, curl, values))
 
     def solve(div, curl, values):
-        return solve_div_curl(div, curl, grid, boundary, boundary_values=values, settings=settings).value
+        return solve_div_curl(div, curl, grid, boundary, boundary_values=values, solver=settings).value
 
     assert gradcheck(solve, inputs, fast_mode=grid.dim == 3)
     assert gradgradcheck(lambda *t: solve(*t).square().sum(), inputs, fast_mode=True)
@@ -328,7 +328,7 @@ def test_derivatives_by_weights(grid, varying, boundary):
 
     def solve(*weights):
         w = Weights(*weights)
-        return solve_div_curl(div, curl, grid, boundary, boundary_values=values, weights=w, settings=settings).value
+        return solve_div_curl(div, curl, grid, boundary, boundary_values=values, weights=w, solver=settings).value
 
     assert gradcheck(solve, weights, atol=1e-6, fast_mode=grid.dim == 3)
     assert gradgradcheck(lambda *t: solve(*t).square().sum(), weights, fast_mode=True, atol=1e-4)
@@ -339,8 +339,8 @@ def test_derivatives_through_cg_equal_those_through_the_transform():
     div, curl = (t.requires_grad_() for t in random_data(grid))
     weights = [torch.tensor(w, dtype=torch.float64, requires_grad=True) for w in (2.0, 0.5, 0.1)]
     gradients = []
-    for settings in (SolverSettings(solver="transform"), replace(CG, rtol=1e-13)):
-        value = solve_div_curl(div, curl, grid, weights=Weights(*weights), settings=settings).value
+    for settings in (SolverSettings(method="transform"), replace(CG, rtol=1e-13)):
+        value = solve_div_curl(div, curl, grid, weights=Weights(*weights), solver=settings).value
         gradients.append(torch.autograd.grad(value.sin().sum(), (div, curl, *weights)))
     for a, b in zip(*gradients, strict=True):
         torch.testing.assert_close(a, b, atol=1e-10, rtol=1e-8)
@@ -349,8 +349,8 @@ def test_derivatives_through_cg_equal_those_through_the_transform():
 def test_steps_that_run_out_are_said():
     grid = Grid((20, 20))
     div, curl = random_data(grid)
-    settings = SolverSettings(solver="cg", preconditioner="none", max_steps=3)
-    solution = solve_div_curl(div, curl, grid, settings=settings)
+    settings = SolverSettings(method="cg", preconditioner="none", max_steps=3)
+    solution = solve_div_curl(div, curl, grid, solver=settings)
     assert solution.status == (Status.MAX_STEPS,)
     assert int(solution.steps) == 3
     assert "max_steps" in solution.status[0].value
@@ -392,9 +392,9 @@ def test_wrong_input_is_refused(arguments, message):
             {"weights": Weights(torch.ones(2, 1, 3, 4)), "boundary_values": torch.zeros(3, 2, 4, 5)},
             "batch sizes must agree",
         ),
-        ({"settings": SolverSettings(theta=True)}, "theta belongs to the curl in 3D"),
+        ({"theta": True}, "theta belongs to the curl in 3D"),
         (
-            {"settings": SolverSettings(solver="transform"), "weights": Weights(torch.ones(1, 1, 3, 4))},
+            {"solver": SolverSettings(method="transform"), "weights": Weights(torch.ones(1, 1, 3, 4))},
             "transform is not exact",
         ),
     ],
@@ -407,7 +407,7 @@ def test_wrong_options_are_refused(options, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"solver": "transfrom"}, "did you mean 'transform'"),
+        ({"method": "transfrom"}, "did you mean 'transform'"),
         ({"preconditioner": "jakobi"}, "did you mean 'jacobi'"),
         ({"rtol": -1.0}, "must not be negative"),
         ({"atol": -1.0}, "must not be negative"),

@@ -8,11 +8,12 @@ from torch.autograd import gradcheck, gradgradcheck
 from torchdeform.core.derivatives import CURL_PAIRS
 from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
-from torchdeform.fem.assembly import assemble, to_csr
+from torchdeform.fem.assembly import assemble
 from torchdeform.fem.form import Row, Term, div_curl_form
 from torchdeform.fem.operator import apply_form, assemble_load, form_diagonal
 from torchdeform.fem.quadrature import apply_by_quadrature, load_by_quadrature
 from torchdeform.fem.weights import Weights
+from torchdeform.solvers.cg import to_csr
 
 
 @pytest.mark.parametrize("weights", WEIGHTS)

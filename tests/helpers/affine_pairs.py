@@ -9,9 +9,9 @@ from torch import Tensor
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine
-from torchdeform.metrics.correlation import DetailCorrelation
+from torchdeform.metrics.correlation import ForegroundLNCC
 from torchdeform.metrics.similarity import make_similarity
-from torchdeform.registration.affine.objective import Frame, Level, Masked
+from torchdeform.registration.affine.objective import AffineObjective, MaskedImage, NormalisedFrame
 
 TILTED = {
     2: ((math.cos(0.4), -math.sin(0.4)), (math.sin(0.4), math.cos(0.4))),
@@ -86,14 +86,14 @@ def distance(found: Affine, true: Affine, fixed: Image) -> float:
     return float((found(world) - true(world)).norm(dim=1).mean()) / min(fixed.grid.spacing)
 
 
-def make_level(dim: int, similarity: str = "ncc") -> Level:
+def make_objective(dim: int, similarity: str = "ncc") -> AffineObjective:
     fixed, moving = make_pair(make_true(turn(dim, 10)))
     weight = torch.rand(fixed.data.shape, generator=torch.Generator().manual_seed(1))
     parts = (
-        Masked(replace(fixed, data=fixed.data.double() / 200), weight.double()),
-        Masked(replace(moving, data=moving.data.double() / 200)),
+        MaskedImage(replace(fixed, data=fixed.data.double() / 200), weight.double()),
+        MaskedImage(replace(moving, data=moving.data.double() / 200)),
     )
-    make = {"detail": lambda f, grid: DetailCorrelation(f, 5)}.get(
+    make = {"detail": lambda f, grid: ForegroundLNCC(f, 5)}.get(
         similarity, lambda f, grid: make_similarity(similarity, f, 5, grid=grid)
     )
-    return Level(*parts, Frame.of(fixed), make, 0.1)
+    return AffineObjective(*parts, NormalisedFrame.of(fixed), make, 0.1)

@@ -20,11 +20,11 @@ UNIT = (0.0, 1.0)
 # The functions of images, on intensities that are already between 0 and 1.
 ON_UNIT: dict[str, Callable[..., Tensor]] = {
     "ssd": ssd,
-    "ncc": lambda f, w, mask=None: ncc(f, w, mask=mask, span=UNIT),
-    "lncc": lambda f, w, mask=None: lncc(f, w, mask=mask, window=5, span=UNIT),
-    "mi": lambda f, w, mask=None: mutual_information(f, w, mask=mask, span=UNIT),
-    "nmi": lambda f, w, mask=None: normalised_mutual_information(f, w, mask=mask, span=UNIT),
-    "ngf": lambda f, w, mask=None: ngf(f, w, mask=mask, span=UNIT),
+    "ncc": lambda f, w, mask=None: ncc(f, w, mask=mask, intensity_range=UNIT),
+    "lncc": lambda f, w, mask=None: lncc(f, w, mask=mask, window=5, intensity_range=UNIT),
+    "mi": lambda f, w, mask=None: mutual_information(f, w, mask=mask, intensity_range=UNIT),
+    "nmi": lambda f, w, mask=None: normalised_mutual_information(f, w, mask=mask, intensity_range=UNIT),
+    "ngf": lambda f, w, mask=None: ngf(f, w, mask=mask, intensity_range=UNIT),
 }
 
 

@@ -167,7 +167,7 @@ def broken(tmp_path: Path, what: str) -> Path:
     ("what", "message"),
     [
         ("missing", "2 slices are missing between a-21.dcm and a-11.dcm"),
-        ("doubled", "a-28.dcm and copy.dcm are slices at the same place"),
+        ("doubled", "a-28.dcm and copy.dcm are slices at the same position"),
         ("tilted", "shifted sideways by 0.4 mm each"),
         ("cut", "a-28.dcm is damaged or incomplete"),
     ],

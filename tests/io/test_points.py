@@ -179,7 +179,7 @@ def test_what_cannot_be_matched_is_refused():
         ("p.mrk.json", "[]", "no file of markups"),
         ("p.mrk.json", '{"markups": [3]}', "no file of markups"),
         ("p.mrk.json", '{"markups": []}', "holds no points"),
-        ("p.mrk.json", json.dumps({"markups": [MARKUP | {"coordinateUnits": "um"}]}), "counts in um"),
+        ("p.mrk.json", json.dumps({"markups": [MARKUP | {"coordinateUnits": "um"}]}), "has its points in um"),
         ("p.mrk.json", json.dumps({"markups": [MARKUP | {"coordinateSystem": "IJK"}]}), "coordinate system 'IJK'"),
         ("p.mrk.json", '{"markups": [{"controlPoints": [{"position": [1, 2]}]}]}', "without 3 coordinates"),
         ("p.mrk.json", '{"markups": [{"controlPoints": [{"position": [1, 2, null]}]}]}', "are no coordinates"),
@@ -201,12 +201,12 @@ def test_wrong_places_and_dimensions_are_one_sentence(tmp_path, make_image):
     with pytest.raises(InputError, match="is no text"):
         read_points(tmp_path / "binary.csv")
     path = _write(tmp_path, "p.csv", "x,y,z\n1,2,3\n")
-    with pytest.raises(InputError, match="points of 3D, but 2D is needed"):
+    with pytest.raises(InputError, match="holds 3D points, but 2D is needed"):
         read_points(path, make_image((8, 8)))
     flat = _write(tmp_path, "flat.csv", "x,y\n1,2\n")
-    with pytest.raises(InputError, match="points of 2D, but 3D is needed"):
+    with pytest.raises(InputError, match="holds 2D points, but 3D is needed"):
         read_points(flat, dim=3)
-    with pytest.raises(InputError, match="points of 2D, but image is 3D"):
+    with pytest.raises(InputError, match="holds 2D points, but image is 3D"):
         read_points(_write(tmp_path, "v.csv", "i,j\n1,2\n"), make_image((8, 8, 8)), dim=2)
     with pytest.raises(InputError, match="no ending that points are written with"):
         write_points(_points(), tmp_path / "p.xyz")

@@ -16,7 +16,7 @@ from torchdeform.metrics.correlation import LNCC_FLOOR, LocalCrossCorrelation, l
 def test_lncc_with_a_stride_has_its_derivative_too(shape, stride, masked):
     fixed, warped = images(shape, channels=2)
     mask = soft_mask(shape) if masked else None
-    expected = lncc(fixed, warped.requires_grad_(True), mask=mask, window=7, stride=stride, span=UNIT)
+    expected = lncc(fixed, warped.requires_grad_(True), mask=mask, window=7, stride=stride, intensity_range=UNIT)
     (slope,) = torch.autograd.grad(expected.sum(), warped)
     value, found = LocalCrossCorrelation(fixed, 7, stride).evaluate(warped.detach(), mask)
     torch.testing.assert_close(value, expected.detach(), rtol=1e-8, atol=1e-9)
@@ -55,7 +55,7 @@ def test_lncc_is_a_loop_over_windows(shape, masked):
         if m[node] > 0:
             c = np.cov(f[cut].ravel(), w[cut].ravel(), aweights=m[cut].ravel(), ddof=0)
             total += m[node] * c[0, 1] ** 2 / ((c[0, 0] + LNCC_FLOOR) * (c[1, 1] + LNCC_FLOOR))
-    found = lncc(fixed, warped, mask=weight if masked else None, window=3, span=UNIT)
+    found = lncc(fixed, warped, mask=weight if masked else None, window=3, intensity_range=UNIT)
     assert found.item() == pytest.approx(total / m.sum(), rel=1e-9)
 
 

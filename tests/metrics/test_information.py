@@ -33,7 +33,7 @@ def test_mutual_information_is_that_of_a_histogram_filled_voxel_by_voxel(bins, m
     weight = np.ones(shape) if mask is None else mask[0, 0].numpy()
     table = _histogram(fixed.numpy(), warped.numpy(), weight, bins)
     joint, alone = _entropy(table), _entropy(table.sum(0)) + _entropy(table.sum(1))
-    arguments = {"mask": mask, "bins": bins, "span": UNIT}
+    arguments = {"mask": mask, "bins": bins, "intensity_range": UNIT}
     assert mutual_information(fixed, warped, **arguments).item() == pytest.approx(alone - joint, rel=1e-9)
     assert normalised_mutual_information(fixed, warped, **arguments).item() == pytest.approx(alone / joint, rel=1e-9)
 

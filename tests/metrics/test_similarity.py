@@ -5,15 +5,24 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
+from nested_settings import changed, settings_of
 
+from torchdeform.cohort.estimate import estimate
+from torchdeform.cohort.plan import Job
 from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.core.warp import warp
 from torchdeform.errors import InputError
+from torchdeform.io import write_image
 from torchdeform.metrics.mind import mind_ssc
-from torchdeform.metrics.similarity import SIMILARITIES, features, make_similarity, on_one_scale, similarity_weights
+from torchdeform.metrics.similarity import MEASURES, features, make_similarity, needs_common_scale, similarity_weights
+from torchdeform.nn import SimilarityLoss
+from torchdeform.pipeline.citations import citations
 from torchdeform.pipeline.config import load_settings
+from torchdeform.pipeline.memory import footprint
+from torchdeform.pipeline.register import PairFiles
+from torchdeform.registration.affine.settings import AlignmentSettings
 from torchdeform.registration.deformable import register
-from torchdeform.registration.settings import RegistrationSettings
 
 SHAPES = [(9, 12), (8, 9, 10)]
 PAIRS = {2: 4, 3: 12}
@@ -67,9 +76,9 @@ def test_the_derivative_of_a_combination_is_that_of_its_value(weights):
 
 
 def test_only_a_squared_difference_of_intensities_needs_one_scale():
-    assert [name for name in SIMILARITIES if on_one_scale(name)] == ["ssd"]
-    assert on_one_scale({"mi": 1, "ssd": 0.1})
-    assert not on_one_scale({"mi": 1, "mind": 0.1})
+    assert [name for name in MEASURES if needs_common_scale(name)] == ["ssd"]
+    assert needs_common_scale({"mi": 1, "ssd": 0.1})
+    assert not needs_common_scale({"mi": 1, "mind": 0.1})
 
 
 @pytest.mark.parametrize(
@@ -90,7 +99,7 @@ def test_only_a_squared_difference_of_intensities_needs_one_scale():
     ],
 )
 def test_unknown_names_and_bad_weights_are_explained(similarity, message):
-    for function in (similarity_weights, lambda s: RegistrationSettings(similarity=s)):
+    for function in (similarity_weights, lambda s: settings_of(similarity=s)):
         with pytest.raises(InputError, match=message):
             function(similarity)
     with pytest.raises(InputError, match="similarity"):
@@ -98,14 +107,14 @@ def test_unknown_names_and_bad_weights_are_explained(similarity, message):
 
 
 def test_settings_take_a_name_or_weights():
-    assert RegistrationSettings(similarity="mi").similarity == "mi"
+    assert settings_of(similarity="mi").similarity == "mi"
     given = {"lncc": 1, "mi": 0.5}
-    settings = RegistrationSettings(similarity=given)
+    settings = settings_of(similarity=given)
     given["mi"] = 7
     assert settings.similarity == {"lncc": 1, "mi": 0.5}
     assert asdict(settings)["similarity"] == {"lncc": 1, "mi": 0.5}
     assert pickle.loads(pickle.dumps(settings)) == settings
-    assert replace(settings, window=5).similarity == settings.similarity
+    assert changed(settings, window=5).similarity == settings.similarity
 
 
 def test_weights_come_from_files_and_overrides(tmp_path):
@@ -116,7 +125,7 @@ def test_weights_come_from_files_and_overrides(tmp_path):
     assert load_settings(file=file, overrides={"similarity": "mi"}).similarity == "mi"
 
 
-@pytest.mark.parametrize("similarity", [*SIMILARITIES, {"lncc": 1, "mind": 2}])
+@pytest.mark.parametrize("similarity", [*MEASURES, {"lncc": 1, "mind": 2}])
 def test_a_registration_climbs_it(similarity):
     """Waves bent by a known map are bent back, with another contrast for the measures that allow it."""
     grid = Grid((64, 60))
@@ -127,9 +136,29 @@ def test_a_registration_climbs_it(similarity):
     fixed = warp(moving, truth, grid)
     if similarity not in ("ssd", "ncc"):
         fixed = 5 - 2 * fixed
-    settings = RegistrationSettings(similarity=similarity, steps=(40, 30), length=6.0)
+    settings = settings_of(similarity=similarity, steps=(40, 30), length_scale=6.0)
     result = register(fixed, moving, settings)
     before = truth.square().sum(1).sqrt().mean()
     after = (result.displacement - truth).square().sum(1).sqrt().mean()
     assert after < 0.3 * before
     assert (result.similarity_after > result.similarity_before).all()
+
+
+def test_a_new_measure_is_a_new_row(monkeypatch, tmp_path):
+    """Whoever asks for a measure by name reads the table."""
+    row = replace(MEASURES["ncc"], memory=(1e4, 1e4), time=100.0, common_scale=True, references=("new",))
+    monkeypatch.setitem(MEASURES, "new", row)
+    settings, old = settings_of(similarity="new"), settings_of(similarity="ncc")
+    fixed, moving = (torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(k)) for k in (0, 1))
+    found = register(fixed, moving, changed(settings, steps=(2,)))
+    assert found.similarity_after > found.similarity_before
+    assert needs_common_scale("new")
+    assert AlignmentSettings(similarity="new").similarity == "new"
+    assert load_settings(overrides={"similarity": {"new": 2}}).similarity == {"new": 2.0}
+    assert SimilarityLoss("new")(fixed, moving) == SimilarityLoss("ncc")(fixed, moving)
+    assert footprint(Grid((64, 64)), 1, settings) > footprint(Grid((64, 64)), 1, old)
+    assert set(citations(settings)) - set(citations(old)) == {"new"}
+    write_image(Image(fixed, Grid((64, 64))), path := tmp_path / "a.nrrd")
+    files = PairFiles(fixed=path, moving=path, out=tmp_path)
+    slow, fast = (estimate([Job(name="a", files=files, settings=some)]).seconds for some in (settings, old))
+    assert slow > fast

@@ -10,7 +10,7 @@ from torchdeform.core.diagnostics import diagnose
 from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.nn import JacobianCurlHead
-from torchdeform.nn.heads import draw_back, flow_to_monitor, with_mean_one
+from torchdeform.nn.heads import flow_to_monitor, scale_to_bounds, with_mean_one
 
 GRIDS = [Grid((24, 20), (1.0, 1.5)), Grid((12, 10, 14), (1.0, 2.0, 1.0))]
 
@@ -117,12 +117,12 @@ def test_on_a_gpu_and_back():
     assert torch.equal(head.cpu()(features), here)
 
 
-def test_draw_back_finds_nearly_the_longest_share():
+def test_scale_to_bounds_finds_nearly_the_longest_share():
     """A displacement t·s·(x − m) has determinant (1 + t s)^D: with s = −2 the bound 0.25 in 2D is met at t = 1/4."""
     grid = Grid((9, 9))
     u = -2 * (grid.points(dtype=torch.float64) - 4)
     mild = 0.1 * u
-    found = draw_back(torch.cat([u, mild]), grid, 0.25)
+    found = scale_to_bounds(torch.cat([u, mild]), grid, 0.25)
     assert torch.equal(found[1:], mild)
     share = float(found[0, 0, 0, 0] / u[0, 0, 0, 0])
     assert 0.25 - 1 / 64 <= share <= 0.25
@@ -132,7 +132,7 @@ def test_draw_back_finds_nearly_the_longest_share():
 def test_what_is_not_finite_stays_visible():
     grid = GRIDS[0]
     u = torch.full((1, 2, *grid.shape), torch.nan)
-    assert bool(draw_back(u, grid, 0.1).isnan().all())
+    assert bool(scale_to_bounds(u, grid, 0.1).isnan().all())
 
 
 def test_wrong_input_is_refused():

@@ -6,19 +6,19 @@ import torch
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import invert
 from torchdeform.errors import InputError
+from torchdeform.metrics.similarity import MEASURES
 from torchdeform.nn import CurlLoss, DeterminantLoss, DiceLoss, DivergenceLoss, InverseConsistencyLoss, SimilarityLoss
-from torchdeform.nn.losses import SIMILARITIES
 
 GRIDS = [Grid((9, 8), (1.0, 1.5)), Grid((7, 6, 8), (1.0, 2.0, 1.0))]
 
 
-@pytest.mark.parametrize("name", SIMILARITIES)
+@pytest.mark.parametrize("name", MEASURES)
 @pytest.mark.parametrize("grid", GRIDS)
 def test_a_similarity_is_best_for_the_image_itself(name, grid):
     image, other = torch.rand(2, 2, 1, *grid.shape, generator=torch.Generator().manual_seed(0)).unbind(0)
     loss = SimilarityLoss(name)
     assert loss(image, image) < loss(image, other)
-    assert loss(image, other) == -SIMILARITIES[name](image, other).mean()
+    assert loss(image, other) == -MEASURES[name].function(image, other).mean()
     warped = other.clone().requires_grad_()
     loss(image, warped).backward()
     assert bool(warped.grad.isfinite().all())
@@ -27,13 +27,13 @@ def test_a_similarity_is_best_for_the_image_itself(name, grid):
 @pytest.mark.parametrize("name", ["ssd", "ncc", "lncc", "nmi", "ngf", "mind"])
 def test_similarity_gradcheck(name):
     images = torch.rand(2, 1, 1, 5, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    options = {} if name in ("ssd", "mind") else {"span": (-0.5, 1.5)}
+    options = {} if name in ("ssd", "mind") else {"intensity_range": (-0.5, 1.5)}
     loss = SimilarityLoss(name, **options)
     fixed, warped = images[0].requires_grad_(name != "ngf"), images[1].requires_grad_()  # its η counts as constant
     assert torch.autograd.gradcheck(loss, (fixed, warped), atol=1e-4)
 
 
-@pytest.mark.parametrize("name", SIMILARITIES)
+@pytest.mark.parametrize("name", MEASURES)
 def test_autocast_changes_nothing(name):
     images = torch.rand(2, 1, 1, 12, 14, generator=torch.Generator().manual_seed(0)).bfloat16()
     plain = SimilarityLoss(name)(*images.float())
@@ -49,7 +49,7 @@ def test_options_and_masks_are_passed_on():
     mask[..., :8] = 1
     loss = SimilarityLoss("lncc", window=5)
     assert loss(*images) != SimilarityLoss("lncc", window=9)(*images)
-    assert loss(*images, mask) == -SIMILARITIES["lncc"](*images, mask=mask, window=5).mean()
+    assert loss(*images, mask) == -MEASURES["lncc"].function(*images, mask=mask, window=5).mean()
     assert "window=5" in repr(loss)
 
 

@@ -2,13 +2,13 @@
 
 import pytest
 import torch
+from nested_settings import settings_of
 
 from torchdeform.core.diagnostics import diagnose
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import warp
 from torchdeform.errors import InputError
 from torchdeform.nn import DeformableRegistration, SimilarityLoss
-from torchdeform.registration.settings import RegistrationSettings
 
 GRIDS = [Grid((32, 28), (1.0, 1.5)), Grid((14, 16, 12), (1.0, 2.0, 1.0))]
 
@@ -23,7 +23,7 @@ def pair(grid: Grid, make_displacement, dtype: torch.dtype = torch.float32) -> t
 @pytest.mark.parametrize("similarity", ["lncc", "ssd", "nmi"])
 def test_similarity_rises_without_folds(grid, similarity, make_displacement):
     fixed, moving = pair(grid, make_displacement)
-    refine = DeformableRegistration(grid, steps=15, settings=RegistrationSettings(similarity=similarity))
+    refine = DeformableRegistration(grid, steps=15, settings=settings_of(similarity=similarity))
     u = refine(fixed, moving)
     loss = SimilarityLoss(similarity)
     assert loss(fixed, warp(moving, u, grid)) < loss(fixed, moving)
@@ -52,7 +52,7 @@ def test_gradients_go_through_the_steps(make_displacement):
     """The start's gradient is that of finite differences along a direction."""
     grid = Grid((12, 14))
     fixed, moving = pair(grid, make_displacement, torch.float64)
-    settings = RegistrationSettings(similarity="ssd", step_length=0.1)
+    settings = settings_of(similarity="ssd", step_length=0.1)
     refine = DeformableRegistration(grid, steps=3, settings=settings)
     start = (0.4 * make_displacement(grid, 0.06).double()).requires_grad_()
     fixed, moving = fixed.requires_grad_(), moving.requires_grad_()
@@ -76,6 +76,6 @@ def test_wrong_input_is_refused():
         DeformableRegistration(GRIDS[0], steps=0)
     for similarity in ("mind", {"lncc": 1.0, "mi": 1.0}):
         with pytest.raises(InputError, match="similarity"):
-            DeformableRegistration(GRIDS[0], settings=RegistrationSettings(similarity=similarity))
+            DeformableRegistration(GRIDS[0], settings=settings_of(similarity=similarity))
     with pytest.raises(InputError, match="fixed must have shape"):
         DeformableRegistration(GRIDS[0])(torch.zeros(1, 1, 4, 4), torch.zeros(1, 1, 4, 4))

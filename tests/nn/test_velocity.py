@@ -129,8 +129,10 @@ def test_wrong_input_is_refused():
     grid = GRIDS[0]
     with pytest.raises(InputError, match="boundary"):
         DivCurlVelocity(grid, "sticky")
-    with pytest.raises(InputError, match="solve_div_curl"):
-        DivCurlVelocity(grid, "dirichlet", weight_div=2.0)
+    with pytest.raises(InputError, match="take solver='auto'"):
+        DivCurlVelocity(grid, "dirichlet", weight_div=2.0, solver="transform")
+    with pytest.raises(InputError, match="did you mean 'assembled'"):
+        DivCurlVelocity(grid, solver="asembled")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="positive"):
         DivCurlVelocity(grid, weight_curl=0.0)
     with pytest.raises(InputError, match="div must have shape"):

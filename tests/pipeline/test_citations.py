@@ -3,11 +3,11 @@
 import re
 
 import pytest
+from nested_settings import settings_of
 
-from torchdeform.metrics.similarity import SIMILARITIES
+from torchdeform.metrics.similarity import MEASURES
 from torchdeform.pipeline.citations import bibliography, citations
 from torchdeform.pipeline.config import load_settings
-from torchdeform.registration.settings import RegistrationSettings
 
 ALWAYS = {"torchdeform", "liu2007reconstruction", "liu2024finite"}
 
@@ -30,7 +30,7 @@ def test_entries_are_whole(key, entry):
 
 
 def test_every_entry_is_cited_by_some_settings():
-    several = RegistrationSettings(similarity=dict.fromkeys(SIMILARITIES, 1.0), start="discrete")
+    several = settings_of(similarity=dict.fromkeys(MEASURES, 1.0), start="discrete")
     assert set(citations(several)) == set(bibliography())
 
 

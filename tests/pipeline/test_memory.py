@@ -9,20 +9,29 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 from memory import QUICK, estimated, measure  # type: ignore[attr-defined]
+from nested_settings import settings_of
 
 import torchdeform.pipeline.memory as memory
 from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import MIN_NODES
 from torchdeform.errors import InputError
-from torchdeform.metrics.similarity import SIMILARITIES
-from torchdeform.pipeline.memory import available, estimate, fitting_grid, parse_size, peak, readable
+from torchdeform.metrics.similarity import MEASURES
+from torchdeform.pipeline.memory import available, fitting_grid, footprint, parse_size, peak, readable
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="measured by what Linux tells of a process")
 
 
+def need(grid: Grid, channels: int = 1, **settings: object) -> int:
+    return footprint(grid, channels, settings_of(**settings))
+
+
+def fitting(grid: Grid, limit: int, **settings: object) -> Grid:
+    return fitting_grid(grid, limit, 1, settings_of(**settings))
+
+
 @linux
 @pytest.mark.parametrize("case", QUICK, ids=str)
-def test_the_estimate_is_what_a_process_takes(case):
+def test_the_footprint_is_what_a_process_takes(case):
     """From files to files, in a fresh process, within a quarter."""
     assert estimated(case) == pytest.approx(measure(case), rel=0.25)
 
@@ -30,23 +39,42 @@ def test_the_estimate_is_what_a_process_takes(case):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_more_takes_more(dim):
     small, large = Grid((64,) * dim), Grid((96,) * dim)
-    for name in SIMILARITIES:
-        assert estimate(small, similarity=name) < estimate(large, similarity=name)
-        assert estimate(small, similarity=name) < estimate(small, channels=3, similarity=name)
-    assert estimate(small, similarity="lncc") < estimate(small, similarity={"lncc": 1.0, "mind": 0.5})
-    assert estimate(small, similarity="ssd") < estimate(small, similarity="ssd", start="discrete")
-    assert estimate(small, channels=9, similarity={"lncc": 1.0, "mind": 0.5}) == estimate(
+    for name in MEASURES:
+        assert need(small, similarity=name) < need(large, similarity=name)
+        assert need(small, similarity=name) < need(small, channels=3, similarity=name)
+    assert need(small, similarity="lncc") < need(small, similarity={"lncc": 1.0, "mind": 0.5})
+    assert need(small, similarity="ssd") < need(small, similarity="ssd", start="discrete")
+    assert need(small, channels=9, similarity={"lncc": 1.0, "mind": 0.5}) == need(
         small, channels=9, similarity={"lncc": 1.0, "mind": 0.5}, start="discrete"
-    )  # the climb holds more
-    finest = fitting_grid(large, 560_000_000, similarity="ssd", start="discrete")
-    assert estimate(finest, similarity="ssd", start="discrete") <= 560_000_000
+    )  # its levels hold more
+    finest = fitting(large, 560_000_000, similarity="ssd", start="discrete")
+    assert need(finest, similarity="ssd", start="discrete") <= 560_000_000
+
+
+def test_two_maps_take_twice_as_much_for_a_voxel_but_no_second_process():
+    small, large = Grid((64, 64, 64)), Grid((96, 96, 96))
+    one, two = (need(large, symmetric=both) - need(small, symmetric=both) for both in (False, True))
+    assert two == 2 * one
+    assert need(small, symmetric=True) == need(small) + need(small) - need(Grid((2, 2, 2))) + 960
+    assert need(large, similarity="ssd", start="discrete") < need(large, similarity="ssd", symmetric=True)
+
+
+def test_the_limit_of_two_maps_is_the_one_that_was_given():
+    """And the size that is advised suffices."""
+    grid = Grid((64, 64, 64))
+    with pytest.raises(InputError, match=r"--memory 460MB is too little for a fixed image of 64×64×64: give") as said:
+        fitting(grid, 460_000_000, symmetric=True)
+    least = parse_size(str(said.value).partition("at least ")[2].partition(",")[0])
+    assert max(fitting(grid, round(1.01 * least), symmetric=True).shape) < 64
+    assert fitting(grid, need(grid, symmetric=True), symmetric=True) is grid
+    assert fitting(grid, need(grid, symmetric=True) - 1, symmetric=True) is not grid
 
 
 def test_an_unknown_similarity_is_refused():
     with pytest.raises(InputError, match="similarity must be one of"):
-        estimate(Grid((64, 64)), similarity="lnc")
+        need(Grid((64, 64)), similarity="lnc")
     with pytest.raises(InputError, match="start must be one of"):
-        estimate(Grid((64, 64)), start="discreet")
+        need(Grid((64, 64)), start="discreet")
 
 
 @pytest.mark.parametrize(
@@ -77,32 +105,32 @@ def test_readable_sizes_can_be_read(size):
 @pytest.mark.parametrize("limit", ["1.3GB", "1.35GB", "2GB", "100GB"])
 def test_the_grid_that_fits(spacing, limit):
     grid = Grid((120, 256, 256), spacing)
-    fits = fitting_grid(grid, parse_size(limit))
-    assert estimate(fits) <= parse_size(limit)
+    fits = fitting(grid, parse_size(limit))
+    assert need(fits) <= parse_size(limit)
     assert all(math.isclose(a, b) for a, b in zip(fits.extent, grid.extent, strict=True))
     assert all(MIN_NODES <= small <= large for small, large in zip(fits.shape, grid.shape, strict=True))
     if fits != grid:  # and it is not much coarser than it must be
-        assert estimate(fits) > 0.8 * (parse_size(limit) - estimate(Grid((8, 8, 8)))) + estimate(Grid((8, 8, 8)))
+        assert need(fits) > 0.8 * (parse_size(limit) - need(Grid((8, 8, 8)))) + need(Grid((8, 8, 8)))
 
 
 def test_thick_slices_are_thinned_last():
-    fits = fitting_grid(Grid((60, 256, 256), (4.0, 1.0, 1.0)), parse_size("900MB"))
+    fits = fitting(Grid((60, 256, 256), (4.0, 1.0, 1.0)), parse_size("900MB"))
     assert fits.shape[0] == 60
     assert max(fits.shape[1:]) < 256
 
 
 def test_what_fits_stays():
     grid = Grid((64, 64))
-    assert fitting_grid(grid, parse_size("4GB")) is grid
+    assert fitting(grid, parse_size("4GB")) is grid
 
 
 def test_what_reading_and_writing_take_is_the_least():
     with pytest.raises(
         InputError, match=r"--memory 1GB is too little for a fixed image of 256×256×256: give at"
     ) as said:
-        fitting_grid(Grid((256, 256, 256)), parse_size("1GB"))
+        fitting(Grid((256, 256, 256)), parse_size("1GB"))
     least = str(said.value).partition("at least ")[2].partition(",")[0]
-    assert max(fitting_grid(Grid((256, 256, 256)), round(1.01 * parse_size(least)), similarity="mind").shape) < 256
+    assert max(fitting(Grid((256, 256, 256)), round(1.01 * parse_size(least)), similarity="mind").shape) < 256
 
 
 @linux
@@ -176,4 +204,5 @@ def test_the_peak_is_that_of_the_process():
 
 def test_the_peak_is_not_known_everywhere(monkeypatch):
     monkeypatch.setitem(sys.modules, "resource", None)
+    monkeypatch.setattr(memory, "_STATUS", Path("nowhere"))
     assert peak() is None

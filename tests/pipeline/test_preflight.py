@@ -5,18 +5,20 @@ from dataclasses import replace
 import pytest
 import torch
 from lopsided import lopsided
+from nested_settings import settings_of
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import read_image
+from torchdeform.pipeline.memory import footprint
 from torchdeform.pipeline.preflight import (
     ERROR,
     NOTE,
     WARNING,
     Report,
+    flip_correlations,
     is_oblique,
-    likeness_turned_over,
     orientation,
     preflight,
 )
@@ -121,7 +123,7 @@ def test_scaled_intensities_matter_to_ssd():
     fixed = lopsided(2)
     moving = replace(fixed, data=fixed.data / 4095, name="moving.nii")
     assert "another similarity than ssd" in texts(
-        preflight(fixed, moving, settings=RegistrationSettings(similarity="ssd")), WARNING
+        preflight(fixed, moving, settings=settings_of(similarity="ssd")), WARNING
     )
 
 
@@ -133,17 +135,17 @@ def test_the_header_explains_a_mirrored_array(dim):
     origin = (fixed.grid.extent[-1], *[0.0] * (dim - 1))
     stored = replace(fixed, data=fixed.data.flip(-1), direction=tuple(map(tuple, sign)), origin=origin)
     assert preflight(fixed, stored).findings == ()
-    scores = likeness_turned_over(fixed, stored)
+    scores = flip_correlations(fixed, stored)
     assert max(scores, key=lambda signs: scores[signs]) == (1.0,) * dim
 
 
-def test_likeness_of_blocks_keeps_the_place():
+def test_correlation_of_blocks_keeps_the_place():
     """Coarse grids of a fine and a coarse copy of one image lie on each other."""
     fixed = lopsided(2)
     fine = torch.nn.functional.interpolate(fixed.data, scale_factor=5, mode="bilinear", align_corners=True)
     spacing = tuple(s / (n - 1) for s, n in zip(fixed.grid.extent, fine.shape[2:], strict=True))
     moving = Image(fine, Grid(tuple(fine.shape[2:]), spacing))
-    assert likeness_turned_over(fixed, moving)[1.0, 1.0] > 0.99
+    assert flip_correlations(fixed, moving)[1.0, 1.0] > 0.99
 
 
 def a_mask(image: Image, values: torch.Tensor, **how) -> Image:
@@ -183,6 +185,18 @@ def test_memory_that_will_not_do(monkeypatch):
         assert "--memory" in texts(report, severity)
     monkeypatch.setattr("torchdeform.pipeline.preflight.available", lambda device: None)
     assert preflight(fixed, fixed).findings == ()
+
+
+def test_the_memory_of_what_will_be_registered(monkeypatch):
+    """Two maps take more than one, and a limit that is given is kept to, so nothing is said."""
+    fixed, one, both = lopsided(3), RegistrationSettings(), settings_of(symmetric=True)
+    between = (footprint(fixed.grid, 1, one) + footprint(fixed.grid, 1, both)) / 2
+    monkeypatch.setattr("torchdeform.pipeline.preflight.available", lambda device: between / 0.8)
+    assert preflight(fixed, fixed, settings=one).findings == ()
+    assert "of memory and" in texts(preflight(fixed, fixed, settings=both), WARNING)
+    monkeypatch.setattr("torchdeform.pipeline.preflight.available", lambda device: 10**8)
+    assert "of memory and" in texts(preflight(fixed, fixed), ERROR)
+    assert preflight(fixed, fixed, memory=10**9).findings == ()
 
 
 def test_errors_come_first():

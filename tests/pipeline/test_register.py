@@ -57,3 +57,15 @@ def test_what_is_written_is_what_was_measured(folder):
 def test_without_labels_nothing_is_said_of_them(folder):
     assert main(["fixed.nrrd", "moving.nrrd", "--preset", "fast", "--out", "out", "--quiet"]) == 0
     assert json.loads((folder / "out" / "result.json").read_text())["label_interpolation"] is None
+
+
+def test_a_limit_of_memory_that_is_too_small_is_the_one_that_was_given(folder, capsys):
+    limit = ["--memory", "450MB", "--set", "symmetric=true"]
+    assert main(["fixed.nrrd", "moving.nrrd", *limit, "--out", "out", "--quiet"]) == 2
+    assert "--memory 450MB is too little" in capsys.readouterr().err
+
+
+def test_a_limit_of_memory_is_kept_to_where_less_is_free(folder, monkeypatch):
+    """The check before it refuses nothing that will be made to fit."""
+    monkeypatch.setattr("torchdeform.pipeline.preflight.available", lambda device: 10**8)
+    assert main(["fixed.nrrd", "moving.nrrd", "--memory", "1GB", "--preset", "fast", "--out", "out", "--quiet"]) == 0

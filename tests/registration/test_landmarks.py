@@ -1,20 +1,18 @@
 """Landmarks: they meet, they count beside the images, and contradictions do not make a map fold."""
 
-from dataclasses import replace
-
 import pytest
 import torch
+from nested_settings import changed, settings_of
 from pictures import bend, blobs
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import sample, warp
 from torchdeform.registration.deformable import register
-from torchdeform.registration.landmarks import spread
+from torchdeform.registration.landmarks import scatter_points
 from torchdeform.registration.problem import Guidance
-from torchdeform.registration.settings import RegistrationSettings
 
-QUICK = RegistrationSettings(steps=(30, 20, 10), weight_div=1.0, length=6.0, window=7, align="none")
+QUICK = settings_of(steps=(30, 20, 10), weight_div=1.0, length_scale=6.0, window=7, align="none")
 
 
 def landmarks(truth: Tensor, grid: Grid, count: int = 8) -> tuple[Tensor, Tensor]:
@@ -31,7 +29,7 @@ def test_landmarks_with_a_high_weight_meet_although_the_images_say_otherwise(sha
     truth = bend(grid, 3.0)
     points, ends = landmarks(truth, grid)
     guidance = Guidance(fixed_points=points, moving_points=ends + 1.5)
-    settings = RegistrationSettings(points_weight=30.0, symmetric=symmetric)
+    settings = settings_of(points_weight=30.0, symmetric=symmetric)
     result = register(warp(moving, truth, grid), moving, settings, guidance=guidance)
     assert result.evaluation is not None
     assert result.evaluation.before.distances.mean() > 1.5
@@ -45,11 +43,11 @@ def test_landmarks_and_images_are_combined():
     truth = bend(grid, 3.0)
     points, ends = landmarks(truth, grid)
     fixed = warp(moving, truth, grid)
-    climb = replace(QUICK, tolerance=0.0)  # all steps, so that the ends can be compared
+    climb = changed(QUICK, tolerance=0.0)  # all steps, so that the ends can be compared
     after, similar = [], []
     for weight in (0.0, 0.001, 1.0):
         guidance = Guidance(fixed_points=points, moving_points=ends + 1.5)
-        result = register(fixed, moving, replace(climb, points_weight=weight), guidance=guidance)
+        result = register(fixed, moving, changed(climb, points_weight=weight), guidance=guidance)
         after.append(result.evaluation.after.distances.mean().item())
         similar.append(result.similarity_after.item())
     assert after[0] > after[1] > after[2]
@@ -64,7 +62,7 @@ def test_landmarks_that_contradict_each_other_do_not_make_it_fold(shape, symmetr
     grid, moving = Grid(shape), blobs(shape, 1)
     points, _ = landmarks(torch.zeros(1, grid.dim, *shape), grid)
     guidance = Guidance(fixed_points=points, moving_points=points.flip(2))
-    settings = replace(QUICK, points_weight=100.0, symmetric=symmetric)
+    settings = changed(QUICK, points_weight=100.0, symmetric=symmetric)
     result = register(moving.flip(2), moving, settings, guidance=guidance)
     assert result.diagnosis.folds.item() == 0
     nearer = result.evaluation.after.distances.mean() < result.evaluation.before.distances.mean()
@@ -80,5 +78,5 @@ def test_spreading_is_the_transpose_of_interpolation(shape):
     field = torch.randn(2, 3, *shape, generator=generator).double()
     values = torch.randn(2, 3, 9, generator=generator).double()
     at_points = (sample(field, points, grid) * values).flatten(1).sum(1)
-    at_nodes = (field * spread(values, points, grid)).flatten(1).sum(1)
+    at_nodes = (field * scatter_points(values, points, grid)).flatten(1).sum(1)
     torch.testing.assert_close(at_points, at_nodes)

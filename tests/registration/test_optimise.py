@@ -3,18 +3,22 @@
 import math
 
 import pytest
+import torch
+from nested_settings import settings_of
 from pictures import bend, blobs
 
+from torchdeform.core.diagnostics import one_sided_determinant
+from torchdeform.core.flow import integrate
 from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import thinned
 from torchdeform.core.warp import warp
 from torchdeform.registration import optimise as levels
 from torchdeform.registration.deformable import register
-from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.velocity import VelocityMetric
 
 
 def test_only_large_levels_carry_a_coarser_map(monkeypatch):
-    settings = RegistrationSettings(map_spacing=2.0)
+    settings = settings_of(map_spacing=2.0)
     grid = Grid((40, 48))
     assert levels._map_grid(grid, settings) == grid
     monkeypatch.setattr(levels, "_LARGE", math.prod(grid.shape) - 1)
@@ -27,10 +31,62 @@ def test_a_coarser_map_finds_the_motion_without_folds(monkeypatch, shape, symmet
     monkeypatch.setattr(levels, "_LARGE", 100)
     grid = Grid(shape)
     truth, moving = bend(grid, 3.0), blobs(shape)
-    settings = RegistrationSettings(steps=(60, 60, 40), window=7, symmetric=symmetric)
+    settings = settings_of(steps=(60, 60, 40), window=7, symmetric=symmetric)
     result = register(warp(moving, truth, grid), moving, settings)
     inside = (..., *[slice(5, -5)] * grid.dim)
     before, after = (d.square().sum(1).sqrt()[inside].mean() for d in (truth, result.displacement - truth))
     assert after < 0.3 * before
     assert result.diagnosis.folds.item() == 0
     assert result.displacement.shape[2:] == shape
+
+
+def level_of(grid: Grid, flow: str = "midpoint", **settings) -> levels.Level:
+    chosen = settings_of(flow=flow, elasticity=0.0, **settings)
+    like = torch.zeros(1, 1, *grid.shape, dtype=torch.float64)
+    metric = VelocityMetric.of(grid, chosen.metric, chosen.solver, like)
+    return levels.Level(levels.Objective(None), metric, chosen, steps=1)
+
+
+def state_of(u: torch.Tensor, grid: Grid) -> levels.State:
+    active = torch.ones(len(u), dtype=torch.bool)
+    return levels.State(u, one_sided_determinant(u, grid), torch.zeros_like(u), active, u)
+
+
+@pytest.mark.parametrize("method", ["euler", "midpoint", "rk4", "dopri5", "squaring"])
+def test_a_step_follows_the_flow_of_its_velocity(method):
+    grid = Grid((12, 14), (1.0, 0.5))
+    v = 0.3 * torch.rand(1, 2, *grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    share, moved, lowest = levels.fold_free_step(level_of(grid, method), state_of(torch.zeros_like(v), grid), v)
+    assert share.tolist() == [1.0]
+    torch.testing.assert_close(moved, integrate(v, grid, steps=1, method=method))
+    torch.testing.assert_close(lowest, one_sided_determinant(moved, grid))
+
+
+def test_a_step_that_would_fold_is_shortened_and_others_are_not():
+    grid = Grid((20, 24))
+    v = torch.cat([bend(grid, 1.0), 40 * bend(grid, 1.0)])
+    u = torch.zeros_like(v)
+    share, moved, lowest = levels.fold_free_step(level_of(grid), state_of(u, grid), v)
+    assert share[0] == 1 > share[1]
+    assert (lowest.flatten(1).amin(1) >= 0.03).all()
+    nan = levels.fold_free_step(level_of(grid), state_of(u, grid), v * torch.nan)
+    assert nan[0].tolist() == [0.0, 0.0]
+    assert torch.equal(nan[1], u)
+
+
+def test_every_registration_integrates_by_torchdiffeq_and_solves_as_it_is_told(monkeypatch):
+    """Of each piece of the frame, the calls in a run that asks for it."""
+    import torchdiffeq
+
+    calls = []
+    real = torchdiffeq.odeint
+    monkeypatch.setattr(torchdiffeq, "odeint", lambda *a, **k: calls.append(k["method"]) or real(*a, **k))
+    shape = (32, 36)
+    fixed, moving = blobs(shape, 1), blobs(shape, 2)
+    plain = register(fixed, moving, settings_of(steps=(4, 3)))
+    assert calls
+    assert set(calls) == {"midpoint"}
+    calls.clear()
+    frame = register(fixed, moving, settings_of(steps=(4, 3), flow="rk4", flow__steps=4, solver="assembled"))
+    assert set(calls) == {"rk4"}
+    assert (frame.displacement - plain.displacement).square().sum(1).sqrt().mean() < 0.05

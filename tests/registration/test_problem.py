@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from nested_settings import changed, settings_of
 from pictures import bend, blobs, disc
 from torch import Tensor
 
@@ -15,19 +16,18 @@ from torchdeform.core.warp import sample, warp
 from torchdeform.errors import InputError
 from torchdeform.registration.deformable import register
 from torchdeform.registration.problem import Guidance, moved
-from torchdeform.registration.settings import RegistrationSettings
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
-QUICK = RegistrationSettings(steps=(30, 20, 10), weight_div=1.0, length=6.0, window=7, align="none")
+QUICK = settings_of(steps=(30, 20, 10), weight_div=1.0, length_scale=6.0, window=7, align="none")
 
 
 @pytest.mark.parametrize("similarity", ["lncc", "ssd", {"lncc": 1.0, "ncc": 1.0}])
 @pytest.mark.parametrize("symmetric", [False, True])
 def test_garbage_outside_the_masks_does_not_change_anything(similarity, symmetric):
     shape = (48, 40)
-    settings = replace(QUICK, similarity=similarity, symmetric=symmetric)
+    settings = changed(QUICK, similarity=similarity, symmetric=symmetric)
     masks = disc(shape, (24, 18), 15), disc(shape, (22, 20), 16)
     guidance = Guidance(fixed_mask=masks[0], moving_mask=masks[1])
     images = blobs(shape, 1), blobs(shape, 2)
@@ -62,8 +62,8 @@ def test_boolean_masks_and_masks_of_ones_mean_what_they_say():
     images, mask = (blobs(shape, 1), blobs(shape, 2)), disc(shape, (20, 20), 14)
     as_float, as_bool = (register(*images, QUICK, guidance=Guidance(fixed_mask=m)) for m in (mask, mask > 0))
     assert torch.equal(as_float.displacement, as_bool.displacement)
-    plain = register(*images, replace(QUICK, steps=(5,)))
-    ones = register(*images, replace(QUICK, steps=(5,)), guidance=Guidance(fixed_mask=torch.ones(1, 1, *shape)))
+    plain = register(*images, changed(QUICK, steps=(5,)))
+    ones = register(*images, changed(QUICK, steps=(5,)), guidance=Guidance(fixed_mask=torch.ones(1, 1, *shape)))
     torch.testing.assert_close(plain.displacement, ones.displacement, rtol=0, atol=1e-3)
 
 
@@ -88,12 +88,12 @@ def test_a_start_is_gone_on_from(symmetric):
     grid = Grid(shape)
     truth = bend(grid, 4.0)
     waves = torch.sin(grid.points().sum(1, keepdim=True)) + blobs(shape, 1)  # period 4.4: local optima everywhere
-    settings = replace(QUICK, steps=(0, 0, 10), symmetric=symmetric)
+    settings = changed(QUICK, steps=(0, 0, 10), symmetric=symmetric)
     given = register(warp(waves, truth, grid), waves, settings, start=truth)
     without = register(warp(waves, truth, grid), waves, settings)
     assert given.similarity_after > without.similarity_after + 0.1
     assert (given.displacement - truth).abs().max() < 1.0
-    still = register(waves, waves, replace(settings, steps=(0,)), start=truth)
+    still = register(waves, waves, changed(settings, steps=(0,)), start=truth)
     torch.testing.assert_close(still.displacement, truth, rtol=0, atol=0.05 if symmetric else 1e-6)
 
 
@@ -105,10 +105,10 @@ def test_a_batch_with_guidance_equals_its_items():
     fixed[1] = blobs(shape, 9)[0]
     masks = torch.cat([disc(shape, (20, 20), 15), disc(shape, (24, 30), 12)]).double()
     points = torch.tensor([[[12.0, 25.0], [15.0, 30.0]], [[20.0, 30.0], [22.0, 36.0]]]).double()
-    settings = replace(QUICK, points_weight=0.1)
+    settings = changed(QUICK, points_weight=0.1)
     whole = Guidance(fixed_mask=masks, fixed_points=points, moving_points=points + 1)
     for symmetric in (False, True):
-        settings = replace(settings, symmetric=symmetric)
+        settings = changed(settings, symmetric=symmetric)
         together = register(fixed, moving, settings, guidance=whole)
         for item in range(2):
             part = slice(item, item + 1)
@@ -148,7 +148,7 @@ def test_an_affine_map_comes_after_the_displacement(symmetric):
     fixed, moving, affine, wide, truth = oblique_pair()
     points, ends = world_landmarks(wide, truth, affine)
     guidance = Guidance(fixed_points=points, moving_points=ends)
-    result = register(fixed, moving, replace(QUICK, symmetric=symmetric), guidance=guidance, affine=affine)
+    result = register(fixed, moving, changed(QUICK, symmetric=symmetric), guidance=guidance, affine=affine)
     found = result.evaluation
     assert found.before.distances.mean() > found.aligned.distances.mean() > 1
     assert found.after.distances.mean() < 0.3
@@ -182,7 +182,7 @@ def test_everything_together_on_every_device(symmetric, device):
     points, ends = world_landmarks(wide, truth, affine)
     ones = [replace(i, data=torch.ones_like(i.data)) for i in (fixed, moving)]
     guidance = Guidance(fixed_points=points, moving_points=ends, fixed_mask=ones[0], moving_mask=ones[1])
-    settings = replace(QUICK, symmetric=symmetric, points_weight=0.1)
+    settings = changed(QUICK, symmetric=symmetric, points_weight=0.1)
     start = torch.zeros(1, 2, *fixed.grid.shape).to(device)
     pair = fixed.to(device), moving.to(device)
     result = register(*pair, settings, guidance=guidance.to(device), affine=affine, start=start)
@@ -220,7 +220,7 @@ POINTS = torch.rand(1, 2, 3)
 )
 def test_guidance_that_does_not_fit_is_named(guidance, message):
     with pytest.raises(InputError, match=message):
-        register(*PAIR, replace(QUICK, steps=(1,)), guidance=Guidance(**guidance))
+        register(*PAIR, changed(QUICK, steps=(1,)), guidance=Guidance(**guidance))
 
 
 @pytest.mark.parametrize(
@@ -235,7 +235,7 @@ def test_guidance_that_does_not_fit_is_named(guidance, message):
 )
 def test_guidance_that_does_not_fit_images_is_named(guidance, message):
     with pytest.raises(InputError, match=message):
-        register(*map(image, PAIR), replace(QUICK, steps=(1,), align="none"), guidance=Guidance(**guidance))
+        register(*map(image, PAIR), changed(QUICK, steps=(1,), align="none"), guidance=Guidance(**guidance))
 
 
 def test_starts_and_affine_maps_that_do_not_fit_are_named():

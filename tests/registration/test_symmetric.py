@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import pytest
 import torch
+from nested_settings import changed, settings_of
 from pictures import bend, blobs, disc
-from torch import Tensor
 
-from torchdeform.core.fold_free import lowest_determinant, mended
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, resample
 from torchdeform.core.transform import Affine
@@ -17,12 +16,9 @@ from torchdeform.errors import InputError
 from torchdeform.metrics.evaluation import carry_points
 from torchdeform.registration.deformable import register
 from torchdeform.registration.problem import Guidance, moved
-from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.registration.symmetric import common_axes, middle_frame, root
+from torchdeform.registration.symmetric import common_axes, midspace_frame, root
 
-SYMMETRIC = RegistrationSettings(
-    steps=(30, 20, 10), step_length=0.5, length=6.0, window=7, symmetric=True, align="none"
-)
+SYMMETRIC = settings_of(steps=(30, 20, 10), step_length=0.5, length_scale=6.0, window=7, symmetric=True, align="none")
 
 
 @pytest.mark.parametrize("shape", [(64, 80), (28, 26, 32)])
@@ -30,7 +26,7 @@ SYMMETRIC = RegistrationSettings(
 def test_swapping_the_images_inverts_the_map(shape, similarity):
     grid, moving = Grid(shape), blobs(shape, 1)
     fixed = warp(moving, bend(grid, 3.0), grid)
-    settings = replace(SYMMETRIC, similarity=similarity)
+    settings = changed(SYMMETRIC, similarity=similarity)
     there, back = register(fixed, moving, settings), register(moving, fixed, settings)
     assert max_voxels(there.displacement, grid).item() > 1.5
     for apart in (there.inverse - back.displacement, compose(there.displacement, back.displacement, grid)):
@@ -57,7 +53,7 @@ def test_swapping_with_masks_and_landmarks_inverts_the_map():
     )
     ends = torch.cat([ends, torch.tensor([[[25.0], [35.0]]])], dim=2)
     masks = disc(shape, (26, 24), 20), disc(shape, (28, 26), 22)
-    settings = replace(SYMMETRIC, points_weight=0.1)
+    settings = changed(SYMMETRIC, points_weight=0.1)
     there = register(
         fixed,
         moving,
@@ -82,7 +78,7 @@ def test_a_known_map_is_found_as_well_as_without(shape):
     inside = (..., *[slice(4, -4)] * grid.dim)
     errors = []
     for symmetric in (False, True):
-        u = register(fixed, moving, replace(SYMMETRIC, symmetric=symmetric)).displacement
+        u = register(fixed, moving, changed(SYMMETRIC, symmetric=symmetric)).displacement
         errors.append(float((u - truth).square().sum(1).sqrt()[inside].mean()))
     assert errors[1] < 1.2 * errors[0] + 0.02
 
@@ -117,16 +113,16 @@ def test_the_space_between_does_not_depend_on_the_order():
     second = Image(torch.zeros(1, 1, 40, 25), Grid((40, 25), (0.8, 1.5)), (0.0, 2.0), tilt(-4))
     axes = common_axes(first, second)
     assert axes == common_axes(second, first) == ((1.0, 0.0), (0.0, 1.0))
-    one, other = middle_frame(first, second, axes), middle_frame(second, first, axes)
+    one, other = midspace_frame(first, second, axes), midspace_frame(second, first, axes)
     assert one.grid.shape == other.grid.shape
     assert one.grid.spacing == pytest.approx(other.grid.spacing, rel=1e-12)
     assert one.origin == pytest.approx(other.origin, abs=1e-9)
-    same = middle_frame(first, first, common_axes(first, first))
+    same = midspace_frame(first, first, common_axes(first, first))
     assert same.grid.shape == first.grid.shape
     assert same.origin == pytest.approx(first.origin, abs=1e-6)
     far = replace(second, origin=(500.0, 0.0))
     with pytest.raises(InputError, match="too little in common"):
-        middle_frame(first, far, axes)
+        midspace_frame(first, far, axes)
 
 
 def test_the_root_of_an_affine_map_makes_it_when_it_is_applied_twice():
@@ -142,26 +138,3 @@ def test_the_root_of_an_affine_map_makes_it_when_it_is_applied_twice():
     for matrix in (torch.diag(torch.tensor([-1.0, 1.0])), -torch.eye(2)):
         with pytest.raises(InputError, match="mirroring or a turn by 180"):
             root(Affine(matrix.double(), torch.zeros(2).double()))
-
-
-def folded(shape: tuple[int, ...]) -> Tensor:
-    """A gentle map with one node out of place."""
-    u = bend(Grid(shape), 2.0)
-    u[(0, slice(None), *(n // 2 for n in shape))] += 3.0
-    return u
-
-
-@pytest.mark.parametrize("shape", [(20, 24), (14, 16, 12)])
-def test_mending_opens_folds_and_leaves_the_rest_alone(shape):
-    grid, u = Grid(shape), folded(shape)
-    assert (lowest_determinant(u, grid) < 0).any()
-    both = mended(torch.cat([u, bend(grid, 2.0)]), grid, 0.03)
-    assert (lowest_determinant(both, grid) > 0.03).all()
-    changed = ((both[:1] - u).abs() > 0).any(1)
-    assert changed.sum() < 9**grid.dim
-    assert torch.equal(both[1:], bend(grid, 2.0))
-    edge = torch.zeros(1, grid.dim, *shape)
-    edge[(0, slice(1, None), 0, *(n // 2 for n in shape[1:]))] = 3.0  # along the face, which it must not leave
-    flat = mended(edge, grid)
-    assert (lowest_determinant(flat, grid) > 0).all()
-    assert (flat[:, 0, 0] == 0).all()

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from nested_settings import settings_of
 from torch import Tensor
 
 from torchdeform.core.derivatives import curl, jacobian_determinant
@@ -15,7 +16,6 @@ from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Transform
 from torchdeform.core.warp import compose, max_voxels, voxels, warp
 from torchdeform.errors import InputError
-from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.template import (
     AveragingSettings,
     Lazy,
@@ -27,7 +27,7 @@ from torchdeform.registration.template import (
 )
 
 GRIDS = [Grid((40, 44), (1.0, 0.9)), Grid((16, 18, 17))]
-STILL = RegistrationSettings(align="none", steps=(40, 15), length=(24.0, 12.0))
+STILL = settings_of(align="none", steps=(40, 15), length_scale=(24.0, 12.0))
 
 
 def picture(grid: Grid, waves: float = 1.0) -> Image:
@@ -173,7 +173,7 @@ def test_a_volume_and_two_rounds():
     truth = picture(grid)
     there, _ = known(grid, 3, 2.0)
     images = [replace(truth, data=warp(truth.data.double(), u, grid).float()) for u in there]
-    settings = RegistrationSettings(align="none", steps=(25, 10), length=12.0, window=5)
+    settings = settings_of(align="none", steps=(25, 10), length_scale=12.0, window=5)
     template = build_template(images, settings, rounds=2)
     assert ratio(template.image.data, images[0].data, truth.data) < 0.3
     for map_, image in zip(template.maps, images, strict=True):

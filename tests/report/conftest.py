@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 import torch
+from nested_settings import settings_of
 
 from torchdeform.core.transform import Affine
 from torchdeform.metrics.evaluation import Evaluation, Measures
 from torchdeform.registration.affine.align import Alignment
-from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.command_lines import repeat_command
 from torchdeform.report.record import describe
-from torchdeform.report.report_data import Scene, make_scene
+from torchdeform.report.report_data import ReportData, make_report_data
 
 SHAPES = {2: (40, 52), 3: (20, 26, 31)}
 NASTY = "<script>alert('x')</script> & \"more\""
@@ -29,14 +29,14 @@ def _closed_figures() -> Iterator[None]:
 
 
 @pytest.fixture
-def make_full(make_image, make_result) -> Callable[..., tuple[Scene, dict[str, Any]]]:
-    """Return ``make_full(dim)``: a scene and a record with an alignment, labels, landmarks, warnings and commands."""
+def make_full(make_image, make_result) -> Callable[..., tuple[ReportData, dict[str, Any]]]:
+    """Return ``make_full(dim)``: the data of a report, and a record with everything in it."""
 
-    def make(dim: int, *, labels: int = 3, landmarks: int = 4, **images: Any) -> tuple[Scene, dict[str, Any]]:
+    def make(dim: int, *, labels: int = 3, landmarks: int = 4, **images: Any) -> tuple[ReportData, dict[str, Any]]:
         shape = images.pop("shape", SHAPES[dim])
         fixed = make_image(shape, name=f"/data/{NASTY}/fixed{NASTY}.nii.gz", **images)
         moving = make_image(tuple(n - 3 for n in shape), (1.1,) * dim, name="moving.nii.gz", **images)
-        settings = RegistrationSettings(similarity={"lncc": 1.0, "mi": 0.5}, steps=(5, 4))
+        settings = settings_of(similarity={"lncc": 1.0, "mi": 0.5}, steps=(5, 4))
         result = make_result(fixed, moving, settings)
         shift = Affine(torch.eye(dim, dtype=torch.float64), torch.ones(dim, dtype=torch.float64))
         result = replace(
@@ -55,7 +55,7 @@ def make_full(make_image, make_result) -> Callable[..., tuple[Scene, dict[str, A
             "command": repeat_command(inputs, settings, "cpu", 10**9),
             "folder": "/home/somebody",
         }
-        return make_scene(fixed, moving, result, slices=7), record
+        return make_report_data(fixed, moving, result, slices=7), record
 
     return make
 

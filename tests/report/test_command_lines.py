@@ -1,10 +1,10 @@
 """The commands that a page shows: a shell takes them apart into what was meant."""
 
 import shlex
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from nested_settings import settings_of
 
 from torchdeform.pipeline.config import load_settings, parse_override, preset_names
 from torchdeform.pipeline.memory import parse_size
@@ -18,7 +18,7 @@ FILES = {"fixed": "a b.png", "moving": "it's.png", "out": "$HOME", "fixed_points
     "settings",
     [
         *map(load_settings, preset_names()),
-        RegistrationSettings(similarity={"lncc": 1.0, "mi": 0.5}, tolerance=1e-6, symmetric=True, length=7.0),
+        settings_of(similarity={"lncc": 1.0, "mi": 0.5}, tolerance=1e-6, symmetric=True, length_scale=7.0),
     ],
 )
 def test_the_settings_come_back(settings):
@@ -36,7 +36,7 @@ def test_the_files_come_back():
 
 def test_only_what_differs_is_named():
     assert changed(RegistrationSettings()) == {}
-    assert changed(replace(RegistrationSettings(), window=7)) == {"window": 7}
+    assert changed(settings_of(window=7)) == {"similarity.window": 7}
 
 
 def test_the_result_can_be_applied():

@@ -12,7 +12,7 @@ from torchdeform.core.image import Image
 from torchdeform.io import read_image
 from torchdeform.report.drawing import BLUE, ORANGE
 from torchdeform.report.figures import _cuts, write_overlay, write_overview
-from torchdeform.report.report_data import make_scene
+from torchdeform.report.report_data import make_report_data
 
 
 def half(dim: int, low: bool, **how) -> Image:
@@ -82,7 +82,7 @@ def _pixels(path) -> torch.Tensor:
 @pytest.mark.parametrize(("dim", "channels"), [(2, 1), (2, 3), (2, 4), (3, 1)])
 def test_overview_is_drawn(tmp_path, make_image, make_result, dim, channels):
     fixed, moving = pictures_of(make_image, dim, channels)
-    write_overview(tmp_path / "overview.png", make_scene(fixed, moving, make_result(fixed, moving)))
+    write_overview(tmp_path / "overview.png", make_report_data(fixed, moving, make_result(fixed, moving)))
     pixels = _pixels(tmp_path / "overview.png")
     assert min(pixels.shape[1:]) > 400
     assert pixels.std() > 20
@@ -94,12 +94,12 @@ def test_overview_survives_odd_results(tmp_path, make_image, make_result, dim):
     fixed = make_image((64, 9, 8)[-dim:] if dim == 3 else (9, 200))
     result = make_result(fixed, fixed)
     folded = replace(result, displacement=result.displacement * 40, levels=())
-    write_overview(tmp_path / "overview.png", make_scene(fixed, fixed, folded, slices=1))
+    write_overview(tmp_path / "overview.png", make_report_data(fixed, fixed, folded, slices=1))
     assert _pixels(tmp_path / "overview.png").std() > 5
 
 
 def test_overview_is_the_same_every_time(tmp_path, make_image, make_result):
     fixed, moving = pictures_of(make_image, 2)
     for name in ("a.png", "b.png"):
-        write_overview(tmp_path / name, make_scene(fixed, moving, make_result(fixed, moving)))
+        write_overview(tmp_path / name, make_report_data(fixed, moving, make_result(fixed, moving)))
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from torchdeform.report import make_scene, write_report
+from torchdeform.report import make_report_data, write_report
 from torchdeform.report.record import write_json
 
 FRAMES = {2: 4, 3: 10}
@@ -47,8 +47,8 @@ class _Page(HTMLParser):
         return " ".join(" ".join(self.words).split())
 
 
-def _page(tmp_path, scene, record) -> tuple[str, _Page]:
-    write_report(tmp_path / "report.html", scene, record)
+def _page(tmp_path, report_data, record) -> tuple[str, _Page]:
+    write_report(tmp_path / "report.html", report_data, record)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     return text, _Page(text)
 
@@ -108,8 +108,8 @@ def test_names_cannot_do_anything(tmp_path, make_full, dim):
 def test_few_facts_make_a_page(tmp_path, make_image, make_result):
     """A result of two tensors' images, without alignment, levels, labels or commands, in one slice."""
     fixed = make_image((16, 18, 20))
-    scene = make_scene(fixed, fixed, replace(make_result(fixed, fixed), levels=()), slices=1)
-    _, page = _page(tmp_path, scene, None)
+    report_data = make_report_data(fixed, fixed, replace(make_result(fixed, fixed), levels=()), slices=1)
+    _, page = _page(tmp_path, report_data, None)
     assert page.open == []
     assert "Commands" not in page.text
     assert "Landmarks" not in page.text
@@ -117,21 +117,21 @@ def test_few_facts_make_a_page(tmp_path, make_image, make_result):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_record_from_a_file_makes_the_same_page(tmp_path, make_full, dim):
-    scene, record = make_full(dim)
-    first, _ = _page(tmp_path, scene, record)
+    report_data, record = make_full(dim)
+    first, _ = _page(tmp_path, report_data, record)
     write_json(record, tmp_path / "result.json")
-    again, _ = _page(tmp_path, scene, json.loads((tmp_path / "result.json").read_text(encoding="utf-8")))
+    again, _ = _page(tmp_path, report_data, json.loads((tmp_path / "result.json").read_text(encoding="utf-8")))
     assert first == again
 
 
 def test_figures_that_are_missing_are_dashes(tmp_path, make_full):
     """A record from JSON has null where a figure was not finite."""
-    scene, record = make_full(2)
+    report_data, record = make_full(2)
     for key in ("similarity_after", "determinant_max", "inverse_error_mean", "inverse_error_max"):
         record[key] = None
     record["evaluation"]["after"]["dice"]["2"] = math.nan
     record["evaluation"]["after"]["hausdorff_95"]["2"] = None
-    _, page = _page(tmp_path, scene, record)
+    _, page = _page(tmp_path, report_data, record)
     assert "not a number" in page.text
 
 

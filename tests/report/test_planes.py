@@ -6,7 +6,7 @@ import torch
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.report.planes import PLANES, chosen_plane, planes_of
-from torchdeform.report.report_data import spread
+from torchdeform.report.report_data import evenly_spaced
 
 
 def test_planes_show_the_patient_upright(make_image):
@@ -18,7 +18,7 @@ def test_planes_show_the_patient_upright(make_image):
         (((0, 0, 1), (1, 0, 0), (0, 1, 0)), [(2, False), (1, True), (1, True)]),
     ):
         image = Image(grid_image.data, grid_image.grid, direction=direction)
-        assert [(plane.axes[0], plane.turned[0]) for plane in planes_of(image)] == vertical
+        assert [(plane.axes[0], plane.flipped[0]) for plane in planes_of(image)] == vertical
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -27,7 +27,7 @@ def test_points_of_slices_are_where_the_slices_are(make_image, dim):
     image = make_image((6, 7, 9)[-dim:], (2.0, 1.0, 0.5)[-dim:], tilted=True)
     every = image.grid.points(dtype=torch.float64)
     for plane in planes_of(image):
-        numbers = spread(plane, 3)
+        numbers = evenly_spaced(plane, 3)
         assert torch.equal(plane.arrange(plane.points(numbers)), plane.cut(every, numbers))
         assert plane.cut(every, numbers).shape == (len(numbers), dim, *plane.shape)
         assert torch.equal(plane.arrange(plane.chosen(every, numbers)), plane.cut(every, numbers))

@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+from nested_settings import settings_of
 from report_pairs import pictures_of
 
-from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.record import describe, write_json
 
 
 def test_record_is_plain_json(tmp_path, make_image, make_result):
     fixed, moving = pictures_of(make_image, 3)
-    settings = RegistrationSettings(window=7)
+    settings = settings_of(window=7)
     result = replace(make_result(fixed, moving, settings), similarity_after=torch.tensor([math.nan]))
     write_json(describe(result, fixed, moving), tmp_path / "result.json")
     text = (tmp_path / "result.json").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What a report shows: slices and rates that are what the functions of the library give."""
+"""What a report shows: slices and derivatives that are what the functions of the library give."""
 
 import math
 from dataclasses import replace
@@ -13,14 +13,14 @@ from torchdeform.core.image import resample
 from torchdeform.core.transform import Affine
 from torchdeform.registration.problem import moved
 from torchdeform.report.planes import planes_of
-from torchdeform.report.report_data import grey, make_scene, quantiles, rates, spread, to_unit
+from torchdeform.report.report_data import derivative_fields, evenly_spaced, grey, make_report_data, quantiles, to_unit
 
 
 @pytest.mark.parametrize("depth", [2, 3, 15, 16, 200])
 @pytest.mark.parametrize("count", [1, 2, 7, 15])
 def test_slices_are_spread_around_the_middle(make_image, depth, count):
     plane = planes_of(make_image((depth, 4, 5)))[0]
-    numbers = spread(plane, count)
+    numbers = evenly_spaced(plane, count)
     assert list(numbers) == sorted(set(numbers))
     assert plane.middle in numbers
     assert len(numbers) <= count
@@ -31,7 +31,7 @@ def test_slices_are_spread_around_the_middle(make_image, depth, count):
 def test_rates_are_those_of_the_stencils(shape):
     grid = Grid(shape, (0.7, 1.3, 2.0)[: len(shape)])
     u = torch.randn(1, grid.dim, *shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    found = rates(u, grid)
+    found = derivative_fields(u, grid)
     turn = curl(u, grid)
     torch.testing.assert_close(found["determinant"], jacobian_determinant(u, grid))
     torch.testing.assert_close(found["divergence"], divergence(u, grid))
@@ -44,7 +44,7 @@ def test_a_scene_shows_what_is_there(make_image, make_result, dim):
     fixed, moving = make_image((12, 14, 17)[-dim:], tilted=True), make_image((13, 15, 16)[-dim:], (1.1,) * dim)
     shift = Affine(torch.eye(dim, dtype=torch.float64), torch.full((dim,), 1.5, dtype=torch.float64))
     result = replace(make_result(fixed, moving), affine=shift)
-    scene = make_scene(fixed, moving, result, slices=3)
+    report_data = make_report_data(fixed, moving, result, slices=3)
     fields = {
         "fixed": to_unit(fixed.data, fixed.data),
         "original": to_unit(resample(moving, fixed), moving.data),
@@ -56,14 +56,14 @@ def test_a_scene_shows_what_is_there(make_image, make_result, dim):
     }
     fields["after"] = (fields["warped"] - fields["fixed"]).abs()
     fields["before"] = (fields["moving"] - fields["fixed"]).abs()
-    assert len(scene.slices) == {2: 1, 3: 3}[dim]
-    for cuts in scene.slices:
+    assert len(report_data.slices) == {2: 1, 3: 3}[dim]
+    for cuts in report_data.slices:
         for name, field in fields.items():
             torch.testing.assert_close(cuts.fields[name], cuts.plane.cut(field, cuts.numbers), atol=2e-5, rtol=1e-4)
         _, largest = inverse_error(result.displacement, result.inverse, fixed.grid)
         assert cuts.fields["inverse_error"].max() <= largest + 1e-6
-    assert scene.volumes.sum() <= math.prod(fixed.grid.shape)
-    assert scene.limits["before"] == scene.limits["after"]
+    assert report_data.volumes.sum() <= math.prod(fixed.grid.shape)
+    assert report_data.limits["before"] == report_data.limits["after"]
 
 
 def test_a_scene_survives_odd_images(make_image, make_result):
@@ -72,7 +72,7 @@ def test_a_scene_survives_odd_images(make_image, make_result):
     data = fixed.data.clone()
     data[..., 0, :] = math.nan
     for image in (replace(fixed, data=data), replace(fixed, data=torch.ones_like(data))):
-        cuts = make_scene(image, image, make_result(fixed, fixed)).slices[0]
+        cuts = make_report_data(image, image, make_result(fixed, fixed)).slices[0]
         assert cuts.fields["fixed"].shape[1] == 1
         assert cuts.fields["fixed"].isfinite().all()
     assert grey(fixed).shape[1] == 1

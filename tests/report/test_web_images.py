@@ -2,8 +2,8 @@
 
 import pytest
 
-from torchdeform.report import make_scene
-from torchdeform.report.web_images import frame_of, sprite
+from torchdeform.report import make_report_data
+from torchdeform.report.web_images import frame_of, image_strip
 
 
 def test_a_sprite_holds_the_slices_upright(make_image, make_result):
@@ -14,13 +14,15 @@ def test_a_sprite_holds_the_slices_upright(make_image, make_result):
     import numpy as np
     from PIL import Image as Picture
 
-    scene = make_scene(*[make_image((20, 24, 28))] * 2, make_result(*[make_image((20, 24, 28))] * 2), slices=3)
-    cuts = scene.slices[1]
-    assert cuts.plane.turned == (True, False)
+    report_data = make_report_data(
+        *[make_image((20, 24, 28))] * 2, make_result(*[make_image((20, 24, 28))] * 2), slices=3
+    )
+    cuts = report_data.slices[1]
+    assert cuts.plane.flipped == (True, False)
     frame = frame_of(cuts.plane, 3, 200)
     pixels = np.zeros((3, *cuts.plane.shape, 1), dtype=np.uint8)
     pixels[1, -6:, :6] = 255
-    data = base64.b64decode(sprite(pixels, cuts.plane, frame, 90).partition(",")[2])
+    data = base64.b64decode(image_strip(pixels, cuts.plane, frame, 90).partition(",")[2])
     sheet = np.asarray(Picture.open(io.BytesIO(data)))
     assert sheet.shape == (3 * frame.pitch, frame.across)
     down, across = (values.mean() for values in np.nonzero(sheet > 128))

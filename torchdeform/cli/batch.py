@@ -17,7 +17,7 @@ from torchdeform.cohort.run import review, run
 from torchdeform.cohort.schema import cohort_schema, read_cohort
 from torchdeform.cohort.settings import EngineSettings
 from torchdeform.cohort.summary import FAILURES, PAGE, Summary
-from torchdeform.io.files import staged
+from torchdeform.io.files import atomic_folder
 from torchdeform.pipeline.memory import readable
 from torchdeform.report.record import write_json
 
@@ -117,7 +117,7 @@ def schema(out: SchemaOut = None) -> None:
     if out is None:
         typer.echo(text, nl=False)
         return
-    with staged(out.parent) as folder:
+    with atomic_folder(out.parent) as folder:
         (folder / out.name).write_text(text, encoding="utf-8")
 
 

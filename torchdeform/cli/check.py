@@ -10,9 +10,9 @@ from torchdeform.cli.options import FixedMask, Json, MovingMask, among, print_js
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError, require_choice
 from torchdeform.io import read_image
-from torchdeform.io.files import staged, suffix
+from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.pipeline.preflight import ERROR, Finding, is_oblique, orientation, preflight
-from torchdeform.registration.settings import ALIGNMENTS
+from torchdeform.registration.affine.settings import ALIGNMENTS
 from torchdeform.report.figures import write_overlay
 
 Fixed = Annotated[
@@ -98,6 +98,6 @@ def _draw(out: Path, fixed: Image, moving: Image) -> Path | None:
     """Write the overlay and return where it is; None for a picture and a volume, which do not lie on each other."""
     if fixed.grid.dim != moving.grid.dim:
         return None
-    with staged(out.parent) as folder:
+    with atomic_folder(out.parent) as folder:
         write_overlay(folder / out.name, fixed, moving)
     return out

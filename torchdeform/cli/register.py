@@ -25,8 +25,8 @@ from torchdeform.metrics.similarity import similarity_weights
 from torchdeform.pipeline.config import load_settings, parse_override, preset_names
 from torchdeform.pipeline.memory import parse_size
 from torchdeform.pipeline.register import REPORT, Outcome, PairFiles, register_files
+from torchdeform.registration.affine.settings import ALIGNMENTS
 from torchdeform.registration.result import Progress as Step
-from torchdeform.registration.settings import ALIGNMENTS
 
 Fixed = Annotated[
     Path,
@@ -129,21 +129,21 @@ def register(
     if json:
         print_json({**outcome.record, "out": str(outcome.folder)})
     elif not quiet:
-        for warning in outcome.warnings:
+        for warning in outcome.record["warnings"]:
             typer.echo(f"warning: {warning}", err=True)
         typer.echo(summary(outcome))
 
 
 def summary(outcome: Outcome) -> str:
     """Return what a person wants to know of a registration, in a few lines."""
-    r, measure = outcome.record, " + ".join(similarity_weights(outcome.result.settings.similarity))
+    r, measure = outcome.record, " + ".join(similarity_weights(outcome.result.settings.similarity.measure))
     lines = {
         f"similarity ({measure})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
         "folds": f"{r['folds']}, determinant {r['determinant_min']:.3g} to {r['determinant_max']:.3g}",
         "inverse error": f"{r['inverse_error_mean']:.2g} voxel on average, {r['inverse_error_max']:.2g} at most",
         **_measured(r),
-        "seconds": f"{sum(outcome.seconds.values()):.1f} on {r['device']}",
-        "results": f"{outcome.folder}{os.sep} ({', '.join(outcome.files)})",
+        "seconds": f"{sum(r['seconds'].values()):.1f} on {r['device']}",
+        "results": f"{outcome.folder}{os.sep} ({', '.join(r['files'])})",
         "look at": str(outcome.folder / REPORT),
     }
     return table(lines)

@@ -11,15 +11,13 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import pyramid_grids
 from torchdeform.errors import InputError
 from torchdeform.io.images import image_size
-from torchdeform.metrics.similarity import similarity_weights
-from torchdeform.pipeline import memory
+from torchdeform.pipeline.memory import choices, fitting_grid, footprint
 from torchdeform.registration.optimise import steps_on
 
-# Seconds of one core of an x86 server: of a pair, whatever its size; and per node, step and channel, by dimension, with
-# LNCC and with the other similarities beside it.
+# Seconds of one core of an x86 server: of a pair, whatever its size; and per node, step and channel with
+# LNCC, by dimension; `Measure.time` has the others beside it.
 _PAIR = 1.5
 _PER_NODE_STEP = {2: 2e-7, 3: 3e-7}
-_BESIDE_LNCC = {"ssd": 0.7, "ncc": 0.7, "lncc": 1.0, "mi": 1.1, "nmi": 1.1, "ngf": 1.0, "mind": 1.5}
 
 
 @dataclass(frozen=True)
@@ -59,17 +57,18 @@ def _seconds(job: Job, size: tuple[tuple[int, ...], int] | None) -> float | None
     if size is None:
         return None
     (shape, channels), settings = size, job.settings
-    grid, maps = Grid(shape), 2 if settings.symmetric else 1
+    grid, (measures, _, symmetric) = Grid(shape), choices(settings)
     if job.memory is not None:
         try:
-            grid = memory.fitting_grid(grid, job.memory // maps, channels=channels, similarity=settings.similarity)
+            grid = fitting_grid(grid, job.memory, channels, settings)
         except InputError:  # the pair itself will say so
             return None
-    levels = pyramid_grids(grid, len(settings.steps))
-    steps = settings.steps[len(settings.steps) - len(levels) :]
+    wanted = settings.optimiser.steps
+    levels = pyramid_grids(grid, len(wanted))
+    steps = wanted[len(wanted) - len(levels) :]
     node_steps = sum(math.prod(g.shape) * steps_on(g, n, settings) for g, n in zip(levels, steps, strict=True))
-    beside = sum(_BESIDE_LNCC[name] for name in similarity_weights(settings.similarity))
-    return _PAIR + maps * channels * beside * _PER_NODE_STEP[grid.dim] * node_steps
+    fields = (2 if symmetric else 1) * channels * sum(measure.time for measure in measures.values())
+    return _PAIR + fields * _PER_NODE_STEP[grid.dim] * node_steps
 
 
 def measure(jobs: Sequence[Job]) -> list[int]:
@@ -94,7 +93,5 @@ def _need(job: Job, size: tuple[tuple[int, ...], int] | None) -> int:
     if size is None:
         return job.memory or 0
     shape, channels = size
-    maps = 2 if job.settings.symmetric else 1
-    how = {"channels": channels, "similarity": job.settings.similarity, "start": job.settings.start}
-    need = maps * memory.estimate(Grid(shape), **how)
+    need = footprint(Grid(shape), channels, job.settings)
     return need if job.memory is None else min(need, job.memory)

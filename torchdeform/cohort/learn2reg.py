@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchdeform.cohort.names import Entry, pair_name
+from torchdeform.cohort.names import PairSpec, pair_name
 from torchdeform.cohort.schema import Learn2Reg
 from torchdeform.errors import InputError
 
@@ -18,7 +18,7 @@ _BOTH = ("labels", "points")  # of use only if both images have them
 _CASE = re.compile(r"_(\d{4})_(\d{4})\.nii\.gz$")
 
 
-def learn2reg_entries(source: Learn2Reg) -> list[Entry]:
+def learn2reg_pairs(source: Learn2Reg) -> list[PairSpec]:
     """Return the pairs of one split of a data set.
 
     Raises:
@@ -30,7 +30,7 @@ def learn2reg_entries(source: Learn2Reg) -> list[Entry]:
     if not isinstance(pairs, list) or not pairs:
         raise InputError(f"{source.file} names no pairs for the split {source.split} ('{key}'); choose another split")
     beside = {_normal(image["image"]): image for image in _images(content)}
-    return [_entry(pair, beside, source.file, f"{key}[{n}]") for n, pair in enumerate(pairs)]
+    return [_pair_spec(pair, beside, source.file, f"{key}[{n}]") for n, pair in enumerate(pairs)]
 
 
 def submission_name(fixed: Path, moving: Path) -> str:
@@ -77,7 +77,7 @@ def _normal(name: str) -> str:
     return Path(name).as_posix()
 
 
-def _entry(pair: object, beside: Mapping[str, Mapping[str, Any]], file: Path, where: str) -> Entry:
+def _pair_spec(pair: object, beside: Mapping[str, Mapping[str, Any]], file: Path, where: str) -> PairSpec:
     if not isinstance(pair, dict) or not all(isinstance(pair.get(side), str) for side in ("fixed", "moving")):
         raise InputError(f"{file}: {where} must name a fixed and a moving image")
     folder = file.absolute().parent
@@ -89,7 +89,7 @@ def _entry(pair: object, beside: Mapping[str, Mapping[str, Any]], file: Path, wh
         if len({f"fixed_{what}", f"moving_{what}"} & files.keys()) == 1:
             files = {key: path for key, path in files.items() if not key.endswith(what)}
     name = pair_name(files["fixed"], files["moving"], {}, {})
-    return Entry(name=name, files=files, where=f"{file}: {where}", voxels=True)
+    return PairSpec(name=name, files=files, where=f"{file}: {where}", voxels=True)
 
 
 def _beside(image: Mapping[str, Any]) -> list[tuple[str, str]]:

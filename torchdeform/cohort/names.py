@@ -22,7 +22,7 @@ _LONGEST = 200  # characters of a name, so that its folder can be made on any sy
 
 
 @dataclass(frozen=True, kw_only=True)
-class Entry:
+class PairSpec:
     """A pair as the cohort says it, before anything is looked at.
 
     Args:

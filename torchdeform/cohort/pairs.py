@@ -7,8 +7,8 @@ from dataclasses import fields
 from itertools import combinations, pairwise, permutations
 from pathlib import Path
 
-from torchdeform.cohort.learn2reg import learn2reg_entries
-from torchdeform.cohort.names import Entry, entity, image_name, pair_name, shared_parts, subject_of
+from torchdeform.cohort.learn2reg import learn2reg_pairs
+from torchdeform.cohort.names import PairSpec, entity, image_name, pair_name, shared_parts, subject_of
 from torchdeform.cohort.patterns import Found, fill, find, natural, only, search
 from torchdeform.cohort.schema import COMPANIONS, Cohort, Images, Pair, PatternPairs, checked_name
 from torchdeform.cohort.settings import beside, expand
@@ -43,7 +43,7 @@ def find_images(images: Images) -> list[Found]:
     return left
 
 
-def pattern_entries(pattern: PatternPairs, where: str) -> list[Entry]:
+def pattern_pairs(pattern: PatternPairs, where: str) -> list[PairSpec]:
     """Return the pairs of a pattern; a pair whose regions, mask or landmarks cannot be told keeps the reason."""
     images = find_images(pattern)
     if pattern.pairing == "template":
@@ -54,7 +54,7 @@ def pattern_entries(pattern: PatternPairs, where: str) -> list[Entry]:
     if pattern.order is not None:
         for group in groups.values():
             group.sort(key=lambda one: natural(one.parts[str(pattern.order)]))
-    return [entry for group in groups.values() for entry in _PAIRINGS[pattern.pairing](group, pattern, where)]
+    return [pair for group in groups.values() for pair in _PAIRINGS[pattern.pairing](group, pattern, where)]
 
 
 def companions(one: Found, images: Images, side: str) -> dict[str, Path]:
@@ -81,25 +81,25 @@ def _template(moving: Found, pattern: PatternPairs) -> Path | None:
         return None
 
 
-def _to_template(moving: Found, pattern: PatternPairs, where: str) -> Entry:
+def _to_template(moving: Found, pattern: PatternPairs, where: str) -> PairSpec:
     def files() -> dict[str, Path]:
         fixed = {key: only(fill(text, moving.parts)) for key, text in pattern.fixed_files().items()}
         return {**fixed, "moving": moving.path, **companions(moving, pattern, "moving")}
 
-    return _entry(image_name(moving.path, moving.parts), files, where, subject_of(moving.parts))
+    return _pair_spec(image_name(moving.path, moving.parts), files, where, subject_of(moving.parts))
 
 
-def _consecutive(group: list[Found], pattern: PatternPairs, where: str) -> Iterator[Entry]:
+def _consecutive(group: list[Found], pattern: PatternPairs, where: str) -> Iterator[PairSpec]:
     for fixed, moving in pairwise(group):
         yield _between(fixed, moving, pattern, where)
 
 
-def _all(group: list[Found], pattern: PatternPairs, where: str) -> Iterator[Entry]:
+def _all(group: list[Found], pattern: PatternPairs, where: str) -> Iterator[PairSpec]:
     for fixed, moving in (permutations if pattern.both_ways else combinations)(group, 2):
         yield _between(fixed, moving, pattern, where)
 
 
-def _to_member(group: list[Found], pattern: PatternPairs, where: str) -> Iterator[Entry]:
+def _to_member(group: list[Found], pattern: PatternPairs, where: str) -> Iterator[PairSpec]:
     chosen = [one for one in group if pattern.reference.items() <= one.parts.items()]
     if len(chosen) == 1:
         for moving in group:
@@ -110,13 +110,13 @@ def _to_member(group: list[Found], pattern: PatternPairs, where: str) -> Iterato
     parts = {key: group[0].parts[key] for key in pattern.within}
     name = "_".join(entity(*part) for part in parts.items()) or "group"
     problem = f"{len(chosen)} of its {len(group)} images have {wanted}, and one must; check reference and the files"
-    yield Entry(name=name, files={}, where=where, subject=subject_of(parts), problem=problem)
+    yield PairSpec(name=name, files={}, where=where, subject=subject_of(parts), problem=problem)
 
 
 _PAIRINGS = {"consecutive": _consecutive, "all": _all, "group": _to_member}
 
 
-def _between(fixed: Found, moving: Found, pattern: PatternPairs, where: str) -> Entry:
+def _between(fixed: Found, moving: Found, pattern: PatternPairs, where: str) -> PairSpec:
     """Return the pair of two images that were found."""
 
     def files() -> dict[str, Path]:
@@ -125,17 +125,17 @@ def _between(fixed: Found, moving: Found, pattern: PatternPairs, where: str) -> 
         return {"fixed": fixed.path, "moving": moving.path, **dict(beside[0]), **dict(beside[1])}
 
     name = pair_name(fixed.path, moving.path, fixed.parts, moving.parts)
-    return _entry(name, files, where, subject_of(shared_parts(fixed.parts, moving.parts)))
+    return _pair_spec(name, files, where, subject_of(shared_parts(fixed.parts, moving.parts)))
 
 
-def _entry(name: str, files: Callable[[], dict[str, Path]], where: str, subject: str) -> Entry:
+def _pair_spec(name: str, files: Callable[[], dict[str, Path]], where: str, subject: str) -> PairSpec:
     try:
-        return Entry(name=name, files=files(), where=where, subject=subject)
+        return PairSpec(name=name, files=files(), where=where, subject=subject)
     except InputError as error:
-        return Entry(name=name, files={}, where=where, subject=subject, problem=str(error))
+        return PairSpec(name=name, files={}, where=where, subject=subject, problem=str(error))
 
 
-def entries(cohort: Cohort) -> list[Entry]:
+def pair_specs(cohort: Cohort) -> list[PairSpec]:
     """Return the pairs of a cohort as it names them; nothing is looked at but names.
 
     Raises:
@@ -145,11 +145,11 @@ def entries(cohort: Cohort) -> list[Entry]:
     if pairs is None:
         raise InputError(f"{cohort.path} names no pairs; add pairs with one of list, table, pattern and learn2reg")
     if pairs.table is not None:
-        found = table_entries(pairs.table.file)
+        found = table_pairs(pairs.table.file)
     elif pairs.pattern is not None:
-        found = pattern_entries(pairs.pattern, f"{cohort.path}: pairs.pattern")
+        found = pattern_pairs(pairs.pattern, f"{cohort.path}: pairs.pattern")
     elif pairs.learn2reg is not None:
-        found = learn2reg_entries(pairs.learn2reg)
+        found = learn2reg_pairs(pairs.learn2reg)
     else:
         found = [_listed(pair, f"{cohort.path}: pairs.list[{n}]") for n, pair in enumerate(pairs.list or ())]
     if not found:
@@ -176,10 +176,10 @@ def named_images(cohort: Cohort) -> dict[str, dict[str, Path]]:
     return named
 
 
-def _listed(pair: Pair, where: str) -> Entry:
+def _listed(pair: Pair, where: str) -> PairSpec:
     files = {key: path for key in _FILES if (path := getattr(pair, key)) is not None}
     name = pair.name or pair_name(pair.fixed, pair.moving, {}, {})
-    return Entry(name=name, files=files, where=where, settings=pair.settings)
+    return PairSpec(name=name, files=files, where=where, settings=pair.settings)
 
 
 _SEPARATORS = {".csv": ",", ".tsv": "\t"}
@@ -188,7 +188,7 @@ _SETTING = "settings."
 _EMPTY = ("", "n/a")  # BIDS writes n/a where there is nothing
 
 
-def table_entries(path: Path) -> list[Entry]:
+def table_pairs(path: Path) -> list[PairSpec]:
     """Return the pairs of a table; its paths are relative to its own folder.
 
     Raises:
@@ -205,7 +205,7 @@ def table_entries(path: Path) -> list[Entry]:
     reader = csv.reader(lines, delimiter=_SEPARATORS[suffix(path)])
     titles = [title.strip() for title in next(reader, [])]
     _require_columns(titles, path)
-    return [_row_entry(dict(zip(titles, _cells(row, titles, where), strict=True)), path.parent, where)
+    return [_row_pair(dict(zip(titles, _cells(row, titles, where), strict=True)), path.parent, where)
             for row in reader if any(map(str.strip, row)) and (where := f"{path} line {reader.line_num}")]  # fmt: skip
 
 
@@ -227,7 +227,7 @@ def _cells(row: list[str], titles: list[str], where: str) -> list[str]:
     return [cell.strip() for cell in row]
 
 
-def _row_entry(row: Mapping[str, str], folder: Path, where: str) -> Entry:
+def _row_pair(row: Mapping[str, str], folder: Path, where: str) -> PairSpec:
     given = {title: cell for title, cell in row.items() if cell not in _EMPTY}
     for title in ("fixed", "moving"):
         if title not in given:
@@ -238,6 +238,6 @@ def _row_entry(row: Mapping[str, str], folder: Path, where: str) -> Entry:
         settings = (
             parse_override(f"{k.removeprefix(_SETTING)}={v}") for k, v in given.items() if k.startswith(_SETTING)
         )
-        return Entry(name=name, files=files, where=where, settings=dict(settings))
+        return PairSpec(name=name, files=files, where=where, settings=dict(settings))
     except InputError as error:
         raise InputError(f"{where}: {error}") from error

@@ -9,12 +9,12 @@ from typing import Any
 
 from torchdeform import __version__
 from torchdeform.cohort.learn2reg import submission_name
-from torchdeform.cohort.names import Entry, select
-from torchdeform.cohort.pairs import entries
+from torchdeform.cohort.names import PairSpec, select
+from torchdeform.cohort.pairs import pair_specs
 from torchdeform.cohort.schema import Cohort
 from torchdeform.errors import InputError, nearest_name
 from torchdeform.io import read_displacement, read_image
-from torchdeform.io.files import staged
+from torchdeform.io.files import atomic_folder
 from torchdeform.io.learn2reg import write_voxel_displacement
 from torchdeform.pipeline.register import Outcome, PairFiles, register_files
 from torchdeform.registration.result import Callback
@@ -112,20 +112,20 @@ def plan(cohort: Cohort) -> Plan:
     Notes:
         Of the files only their existence is looked at.
     """
-    found = entries(cohort)
-    _require_apart(found, lambda entry: f"{entry.subject}/{entry.name}", "be called", "name")
+    found = pair_specs(cohort)
+    _require_apart(found, lambda pair: f"{pair.subject}/{pair.name}", "be called", "name")
     if cohort.layout == "learn2reg":
-        whole = [entry for entry in found if not entry.problem]
-        _require_apart(whole, lambda entry: _submission(entry), "be submitted as", "moving image")
+        whole = [pair for pair in found if not pair.problem]
+        _require_apart(whole, lambda pair: _submission(pair), "be submitted as", "moving image")
     resolve = _resolver(cohort)
     jobs: list[Job] = []
     problems: list[Problem] = []
-    for entry in found:
-        sentence = entry.problem or _missing(entry)
+    for pair in found:
+        sentence = pair.problem or _missing(pair)
         if sentence:
-            problems.append(Problem(entry.name, sentence))
+            problems.append(Problem(pair.name, sentence))
         else:
-            jobs.append(_job(entry, cohort, resolve(entry)))
+            jobs.append(_job(pair, cohort, resolve(pair)))
     return Plan(cohort.out, tuple(jobs), tuple(problems))
 
 
@@ -139,68 +139,68 @@ def description() -> dict[str, Any]:
     }
 
 
-def _require_apart(found: Sequence[Entry], place: Callable[[Entry], str], verb: str, remedy: str) -> None:
+def _require_apart(found: Sequence[PairSpec], place: Callable[[PairSpec], str], verb: str, remedy: str) -> None:
     """Raise `InputError` if two pairs would write one place; capitals do not count, as on some disks."""
-    seen: dict[str, Entry] = {}
-    for entry in found:
-        key = place(entry)
-        first = seen.setdefault(key.casefold(), entry)
-        if first is not entry:
-            both = f"{_between(first)} ({first.where}) and {_between(entry)} ({entry.where})"
+    seen: dict[str, PairSpec] = {}
+    for pair in found:
+        key = place(pair)
+        first = seen.setdefault(key.casefold(), pair)
+        if first is not pair:
+            both = f"{_between(first)} ({first.where}) and {_between(pair)} ({pair.where})"
             raise InputError(f"{both} would both {verb} {key.strip('/')}; give each its own {remedy}")
-        if entry.name.casefold() in _RESERVED or entry.name.startswith("."):
-            raise InputError(f"{entry.where}: a pair cannot be called {entry.name}, which the results need; rename it")
+        if pair.name.casefold() in _RESERVED or pair.name.startswith("."):
+            raise InputError(f"{pair.where}: a pair cannot be called {pair.name}, which the results need; rename it")
 
 
-def _between(entry: Entry) -> str:
-    ends = [str(entry.files[side]) for side in ("moving", "fixed") if side in entry.files]
-    return " to ".join(ends) or entry.name
+def _between(pair: PairSpec) -> str:
+    ends = [str(pair.files[side]) for side in ("moving", "fixed") if side in pair.files]
+    return " to ".join(ends) or pair.name
 
 
-def _resolver(cohort: Cohort) -> Callable[[Entry], RegistrationSettings]:
+def _resolver(cohort: Cohort) -> Callable[[PairSpec], RegistrationSettings]:
     """Return what resolves a pair's settings, each set of them once."""
     known: dict[str, RegistrationSettings] = {}
 
-    def resolve(entry: Entry) -> RegistrationSettings:
-        key = json.dumps(entry.settings, sort_keys=True, default=str)
+    def resolve(pair: PairSpec) -> RegistrationSettings:
+        key = json.dumps(pair.settings, sort_keys=True, default=str)
         if key not in known:
             try:
-                known[key] = cohort.resolve(entry.settings)
+                known[key] = cohort.resolve(pair.settings)
             except InputError as error:
-                raise InputError(f"{entry.where}: {error}") from error
+                raise InputError(f"{pair.where}: {error}") from error
         return known[key]
 
     return resolve
 
 
-def _missing(entry: Entry) -> str:
+def _missing(pair: PairSpec) -> str:
     """Return what files a pair lacks, as a sentence, empty if none."""
-    for key, path in entry.files.items():
+    for key, path in pair.files.items():
         if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises where a folder may not be looked into
-            return f"{key} {path} does not exist; check {entry.where}"
+            return f"{key} {path} does not exist; check {pair.where}"
     for what in ("points", "labels"):
-        given = [side for side in ("fixed", "moving") if f"{side}_{what}" in entry.files]
+        given = [side for side in ("fixed", "moving") if f"{side}_{what}" in pair.files]
         if len(given) == 1:
             other = {"fixed": "moving", "moving": "fixed"}[given[0]]
-            return f"{given[0]}_{what} needs {other}_{what} too, give both or neither; check {entry.where}"
+            return f"{given[0]}_{what} needs {other}_{what} too, give both or neither; check {pair.where}"
     return ""
 
 
-def _job(entry: Entry, cohort: Cohort, settings: RegistrationSettings) -> Job:
-    files = PairFiles(**entry.files, out=cohort.out / entry.subject / entry.name)
+def _job(pair: PairSpec, cohort: Cohort, settings: RegistrationSettings) -> Job:
+    files = PairFiles(**pair.files, out=cohort.out / pair.subject / pair.name)
     return Job(
-        name=entry.name,
+        name=pair.name,
         files=files,
         settings=settings,
         device=cohort.device,
         memory=cohort.memory,
-        submission=cohort.out / SUBMISSION / _submission(entry) if cohort.layout == "learn2reg" else None,
-        voxels=entry.voxels and entry.files.keys() >= {"fixed_points", "moving_points"},
+        submission=cohort.out / SUBMISSION / _submission(pair) if cohort.layout == "learn2reg" else None,
+        voxels=pair.voxels and pair.files.keys() >= {"fixed_points", "moving_points"},
     )
 
 
-def _submission(entry: Entry) -> str:
-    return submission_name(entry.files["fixed"], entry.files["moving"])
+def _submission(pair: PairSpec) -> str:
+    return submission_name(pair.files["fixed"], pair.files["moving"])
 
 
 _POINTS = ("fixed_points", "moving_points")
@@ -225,7 +225,7 @@ def register_job(job: Job, *, callback: Callback | None = None) -> Outcome:
 def _with_titles(files: PairFiles) -> PairFiles:
     """Return the files with landmarks written anew into the pair's folder, titled i, j, k as `read_points` wants it."""
     given = {key: path for key in _POINTS if (path := getattr(files, key)) is not None}
-    with staged(files.out) as folder:
+    with atomic_folder(files.out) as folder:
         for key, path in given.items():
             rows = path.read_text(encoding="utf-8-sig")
             (folder / f"{key}.csv").write_text(f"i,j,k\n{rows}", encoding="utf-8")

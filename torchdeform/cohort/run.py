@@ -23,7 +23,7 @@ from torchdeform.errors import ComputationError, InputError, explain
 EVENTS = "events.jsonl"
 BEGIN, SKIPPED, END = "begin", "skipped", "end"
 
-_STAGED = ".torchdeform-*"  # folders that `io.files.staged` would have removed
+_TEMPORARY_FOLDERS = ".torchdeform-*"  # folders that `io.files.atomic_folder` would have removed
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,8 @@ def run(
     """
     lacking = tuple(problems)
     _require_names([*jobs, *lacking])
-    with Journal(out) as journal, _events(out, len(jobs) + len(lacking), len(lacking), report) as book:
-        state = _State(out, journal, book)
+    with Journal(out) as journal, _events(out, len(jobs) + len(lacking), len(lacking), report) as log:
+        state = _State(out, journal, log)
         try:
             todo = [job for job in jobs if not (resume and state.settled(job, retry_failed))]
             _clean(todo, out)
@@ -104,7 +104,7 @@ def run(
         finally:
             _clean(jobs, out)
             summary = summarise(jobs, out, state.known, lacking)
-        book.say(END)
+        log.say(END)
     return summary
 
 
@@ -122,7 +122,7 @@ def _require_names(pairs: Sequence[Job | Problem]) -> None:
         raise InputError(f"{count} pairs are called {name}; give each its own name")
 
 
-class _Book:
+class _EventLog:
     """Counts what happens, writes it down, and passes it on."""
 
     def __init__(self, file: IO[str], total: int, failed: int, report: Callable[[Event], None] | None) -> None:
@@ -153,19 +153,19 @@ class _Book:
 
 
 @contextmanager
-def _events(out: Path, total: int, failed: int, report: Callable[[Event], None] | None) -> Iterator[_Book]:
+def _events(out: Path, total: int, failed: int, report: Callable[[Event], None] | None) -> Iterator[_EventLog]:
     with (out / EVENTS).open("a", encoding="utf-8") as file:
-        book = _Book(file, total, failed, report)
-        book.say(BEGIN)
-        yield book
+        log = _EventLog(file, total, failed, report)
+        log.say(BEGIN)
+        yield log
 
 
 class _State:
     """What is known of the pairs in this run."""
 
-    def __init__(self, out: Path, journal: Journal, book: _Book) -> None:
+    def __init__(self, out: Path, journal: Journal, log: _EventLog) -> None:
         self.out, self.known = out, dict[str, Report]()
-        self._journal, self._book = journal, book
+        self._journal, self._book = journal, log
 
     def settled(self, job: Job, retry_failed: bool) -> bool:
         """Return whether a pair need not run, and take its report over if so."""
@@ -262,5 +262,5 @@ def _clean(jobs: Iterable[Job], out: Path) -> None:
     own = {job.files.out for job in jobs}
     above = {folder for place in own for folder in place.parents if folder.is_relative_to(out)}
     for folder in own | above:
-        for rest in folder.glob(_STAGED):
+        for rest in folder.glob(_TEMPORARY_FOLDERS):
             shutil.rmtree(rest, ignore_errors=True)

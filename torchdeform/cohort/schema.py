@@ -22,7 +22,15 @@ from pydantic_core import ErrorDetails
 from torchdeform.cohort.patterns import part_names, require_parts
 from torchdeform.cohort.settings import EngineSettings, Pattern, Place, Size, Strict, TemplateSettings
 from torchdeform.errors import InputError, nearest_name, require_choice
-from torchdeform.pipeline.config import Lines, load_settings, preset_names, read_yaml, read_yaml_lines, to_yaml
+from torchdeform.pipeline.config import (
+    Lines,
+    load_settings,
+    merged_settings,
+    preset_names,
+    read_yaml,
+    read_yaml_lines,
+    to_yaml,
+)
 from torchdeform.registration.settings import RegistrationSettings
 
 # Keys of what goes along with an image, and how a pair calls it after its side.
@@ -267,7 +275,7 @@ class Cohort(Strict):
 
     def resolve(self, overrides: Mapping[str, object] | None = None) -> RegistrationSettings:
         """Return the settings of a pair: the preset, changed by the cohort's settings, changed by ``overrides``."""
-        return load_settings(self.preset, overrides={**self.settings, **(overrides or {})})
+        return load_settings(self.preset, overrides=merged_settings(self.settings, overrides or {}))
 
     def to_yaml(self) -> str:
         """Return the cohort as a file that says everything: paths absolute, variables filled in, all settings."""

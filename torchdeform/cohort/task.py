@@ -14,11 +14,10 @@ from typing import Any
 
 from torchdeform.cohort.plan import Job, register_job
 from torchdeform.errors import InputError, explain
-from torchdeform.pipeline.register import Outcome
+from torchdeform.pipeline.memory import peak
 
 DONE, FAILED = "done", "failed"
 
-_PEAK = "VmHWM:"
 # Figures of a pair's record that go into the summary as they are.
 _FIGURES = (
     "similarity_before",
@@ -84,9 +83,9 @@ def perform(task: Task) -> Report:
 
 def _register(job: Job, start: float) -> Report:
     outcome = register_job(job)
-    for warning in outcome.warnings:
+    for warning in outcome.record["warnings"]:
         sys.stderr.write(f"warning: {warning}\n")
-    return Report(DONE, "", perf_counter() - start, *_peaks(), _figures(outcome), outcome.files)
+    return Report(DONE, "", perf_counter() - start, *_peaks(), _figures(outcome.record), outcome.record["files"])
 
 
 def _sentence(error: Exception) -> str:
@@ -96,8 +95,7 @@ def _sentence(error: Exception) -> str:
     return explain(error)[0]
 
 
-def _figures(outcome: Outcome) -> dict[str, float]:
-    record: dict[str, Any] = outcome.record
+def _figures(record: dict[str, Any]) -> dict[str, float]:
     found = {name: record[name] for name in _FIGURES}
     for column, key in _MEASURED.items():
         for stage in ("before", "after"):
@@ -150,17 +148,7 @@ def _forget_peak() -> None:
 def _peaks() -> tuple[int, int]:
     """Return the peaks of this process's memory and of its GPU's, in bytes."""
     cuda = _cuda()
-    return _peak(), 0 if cuda is None else cuda.max_memory_allocated()
-
-
-def _peak() -> int:
-    with suppress(OSError):
-        for line in Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines():
-            if line.startswith(_PEAK):
-                return int(line.split()[1]) * 1024
-    import resource  # not on every system
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return peak() or 0, 0 if cuda is None else cuda.max_memory_allocated()
 
 
 def _cuda() -> Any:

@@ -20,7 +20,7 @@ from torchdeform.core.transform import Displacement, Transform
 from torchdeform.core.warp import compose
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.io import read_image, read_transform, write_image, write_transform
-from torchdeform.io.files import require_writable, staged
+from torchdeform.io.files import atomic_folder, require_writable
 from torchdeform.io.images import ending_like
 from torchdeform.io.labels import read_labels, write_labels
 from torchdeform.pipeline.register import PairFiles, choose_device
@@ -181,7 +181,7 @@ def _average(current: Round, cohort: Cohort) -> Template | None:
         "bias_voxels": template.shape.bias,
         "seconds": perf_counter() - start,
     }
-    with staged(current.folder) as folder:
+    with atomic_folder(current.folder) as folder:
         write_image(template.image.to("cpu"), folder / TEMPLATE)
         write_json(record, folder / _ROUND)
     return template
@@ -228,7 +228,7 @@ def _publish(
         "files": [TEMPLATE, OVERVIEW, *(name for one in found.values() for name in one["files"])],
     }
     gallery = {"reference": rounds[0].reference} | {f"round {r.number}": r.folder / TEMPLATE for r in rounds}
-    with staged(out) as folder:
+    with atomic_folder(out) as folder:
         write_image(template.image.to("cpu"), folder / TEMPLATE)
         write_gallery(folder / OVERVIEW, {title: read_image(path) for title, path in gallery.items()})
         write_json(record, folder / RECORD)
@@ -240,7 +240,7 @@ def _publish_subject(subject: Subject, from_template: Transform, template: Templ
     place = Path(SUBJECTS) / subject.name
     image, map_ = read_image(subject.image), from_template.to("cpu")
     warped = replace(map_.image(image, template.image.to("cpu")), pixel_type=image.pixel_type)
-    with staged(out / place) as folder:
+    with atomic_folder(out / place) as folder:
         write_transform(map_, folder / _TRANSFORM)
         write_transform(map_.inverse(), folder / _INVERSE)
         write_image(warped, folder / f"{_WARPED}{ending_like(subject.image, warped)}")

@@ -1,9 +1,10 @@
 """Finite differences as kernels: derivative, divergence, curl, Jacobian matrix, determinant and cofactors."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import product
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.core.grid import Grid, over_slabs
@@ -25,7 +26,7 @@ LEAST_ROWS = 4
 CURL_PAIRS: dict[int, tuple[tuple[int, int], ...]] = {2: ((0, 1),), 3: ((1, 2), (2, 0), (0, 1))}
 
 
-def derivative(field: Tensor, grid: Grid, axis: int, *, order: int = 2) -> Tensor:
+def derivative(field: Tensor, grid: Grid, axis: int, *, order: int = 2, by: str = "auto") -> Tensor:
     """Return ∂_axis of every channel by finite differences, one-sided with the same order at the boundary.
 
     Args:
@@ -33,12 +34,14 @@ def derivative(field: Tensor, grid: Grid, axis: int, *, order: int = 2) -> Tenso
         grid: the grid it lives on.
         axis: array axis, 0 to D − 1.
         order: 2 or 4.
+        by: ``convolution`` (`conv2d` or `conv3d` with `kernel_weights`), ``shifts`` (sums of shifted fields), or
+            ``auto``, whichever is faster on the device; they agree to rounding.
 
     Returns:
         ``(B, C, *S)``, the field's unit per unit of spacing.
 
     Raises:
-        InputError: shape, axis, order, or an axis too short for the kernel.
+        InputError: shape, axis, order, way, or an axis too short for the kernel.
 
     Notes:
         Exact on polynomials of degree ``order``; error O(h^order). Linear, so differentiable to every degree.
@@ -46,7 +49,8 @@ def derivative(field: Tensor, grid: Grid, axis: int, *, order: int = 2) -> Tenso
     grid.check(field, "derivative: field")
     require_choice(axis, range(grid.dim), "derivative: axis")
     require_choice(order, KERNELS, "derivative: order")
-    interior, first = KERNELS[order]
+    require_choice(by, _WAYS, "derivative: by")
+    (interior, first), apply = KERNELS[order], _WAYS[by]
     if grid.shape[axis] < len(interior):
         raise InputError(f"derivative: order {order} needs {len(interior)} nodes along axis {axis}, got {grid.shape}")
     step, dim = grid.spacing[axis], axis + 2
@@ -54,9 +58,9 @@ def derivative(field: Tensor, grid: Grid, axis: int, *, order: int = 2) -> Tenso
     width = len(interior)
     head, tail = field.narrow(dim, 0, width), field.narrow(dim, field.shape[dim] - width, width)
     parts = [
-        *(_convolve(head, dim, kernel, step) for kernel in first),
-        _convolve(field, dim, interior, step),
-        *(_convolve(tail, dim, kernel, step) for kernel in last),
+        *(_by_shifts(head, dim, kernel, step) for kernel in first),
+        apply(field, dim, interior, step),
+        *(_by_shifts(tail, dim, kernel, step) for kernel in last),
     ]
     return torch.cat(parts, dim=dim)
 
@@ -83,14 +87,47 @@ def add_adjoint_derivative(total: Tensor, field: Tensor, grid: Grid, axis: int, 
             total.select(dim, n - 1 - k).sub_(field.select(dim, n - 1 - row), alpha=weight / step)
 
 
-def _convolve(field: Tensor, dim: int, kernel: tuple[float, ...], step: float) -> Tensor:
-    """Return Σ_k kernel_k field(x + k h) / h where the kernel fits, by shifted sums: conv3d takes ten times as long."""
+def kernel_weights(kernel: Sequence[float], axis: int, dim: int, like: Tensor, step: float = 1.0) -> Tensor:
+    """Return a kernel as the weights ``(1, 1, *k)`` of `conv2d` or `conv3d`, along one of ``dim`` array axes.
+
+    Args:
+        kernel: weights of neighbouring nodes, as in `KERNELS`.
+        axis: array axis, 0 to D − 1.
+        dim: D.
+        like: a tensor with the type and device wanted.
+        step: spacing along the axis.
+    """
+    shape = [1, 1, *(len(kernel) if a == axis else 1 for a in range(dim))]
+    return torch.tensor([w / step for w in kernel], dtype=torch.float64).view(shape).to(like)
+
+
+def _by_convolution(field: Tensor, dim: int, kernel: tuple[float, ...], step: float) -> Tensor:
+    """Return Σ_k kernel_k field(x + k h) / h where the kernel fits, each channel by itself."""
+    axes = field.dim() - 2
+    weights = kernel_weights(kernel, dim - 2, axes, field, step)
+    return _CONVOLVE[axes](field.flatten(0, 1).unsqueeze(1), weights).view(*field.shape[:2], *_kept(field, dim, kernel))
+
+
+def _kept(field: Tensor, dim: int, kernel: tuple[float, ...]) -> list[int]:
+    """Return the spatial shape that is left where a kernel fits."""
+    return [n - len(kernel) + 1 if a == dim else n for a, n in enumerate(field.shape) if a > 1]
+
+
+def _by_shifts(field: Tensor, dim: int, kernel: tuple[float, ...], step: float) -> Tensor:
+    """Return the same by shifted sums."""
     count = field.shape[dim] - len(kernel) + 1
     (weight, start), *others = [(w / step, k) for k, w in enumerate(kernel) if w]
     total = field.narrow(dim, start, count) * weight
     for weight, start in others:
         total = total.add(field.narrow(dim, start, count), alpha=weight)
     return total
+
+
+_CONVOLVE = {2: F.conv2d, 3: F.conv3d}
+
+# ``auto`` is by shifts: on two threads of a CPU conv2d takes 2 to 5 times as long, conv3d 10 times, from 32² to 128³
+# (``scripts/benchmarks/kernels.py`` measures it, on a GPU too).
+_WAYS = {"auto": _by_shifts, "shifts": _by_shifts, "convolution": _by_convolution}
 
 
 def jacobian(field: Tensor, grid: Grid, *, order: int = 2) -> Tensor:

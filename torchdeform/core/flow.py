@@ -1,23 +1,49 @@
-"""Flows of velocity fields by ODE solvers. The only file that imports torchdiffeq."""
+"""Flows of velocity fields by ODE solvers. The only file that imports torchdiffeq.
+
+torchdiffeq integrates every flow of the package. Its solvers cannot be traced, so while torch.compile or torch.export
+looks on, the methods of fixed steps are run from their tableaux here; a test says that both give the same numbers.
+"""
 
 import math
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.warp import keep_inside, warp
+from torchdeform.core.warp import compose, keep_inside, warp
 from torchdeform.errors import ComputationError, InputError, require_choice
 
-# What moves the state: (time, state) -> its rate of change; time is a scalar tensor.
-Rate = Callable[[Tensor, Tensor], Tensor]
+# What moves the state: (time, state) -> its rate of change; time is a scalar tensor, or a number while tracing.
+Rate = Callable[[Any, Tensor], Tensor]
 
-FIXED_STEP = ("euler", "midpoint", "rk4")
+
+class Tableau(NamedTuple):
+    """An explicit Runge-Kutta method: k_i = rate(t + c_i h, y + h Σ_j a_ij k_j), y ← y + h Σ_i b_i k_i.
+
+    Attributes:
+        stages: the rows a_i, whose sums are c_i, each as long as there are stages before it.
+        weights: b.
+    """
+
+    stages: tuple[tuple[float, ...], ...]
+    weights: tuple[float, ...]
+
+
+# The methods of fixed steps, as torchdiffeq has them; its rk4 is Kutta's 3/8 rule.
+TABLEAUX = {
+    "euler": Tableau(((),), (1.0,)),
+    "midpoint": Tableau(((), (1 / 2,)), (0.0, 1.0)),
+    "rk4": Tableau(((), (1 / 3,), (-1 / 3, 1.0), (1.0, -1.0, 1.0)), (1 / 8, 3 / 8, 3 / 8, 1 / 8)),
+}
+FIXED_STEP = tuple(TABLEAUX)
 ADAPTIVE = ("dopri5",)
+METHODS = (*FIXED_STEP, *ADAPTIVE, "squaring")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,9 +51,11 @@ class OdeSolver:
     """How an ODE is integrated, and how the result is differentiated.
 
     Args:
-        method: ``euler``, ``midpoint`` or ``rk4`` (the 3/8 rule) with steps of equal length, orders 1, 2 and 4; or
-            ``dopri5``, which chooses its steps.
-        steps: steps between two times that are asked for; for ``dopri5`` the first step that it tries is that long.
+        method: ``euler``, ``midpoint`` or ``rk4`` (the 3/8 rule) with steps of equal length, orders 1, 2 and 4;
+            ``dopri5``, which chooses its steps; or, for a stationary velocity, ``squaring`` (v/2ⁿ composed with itself
+            n times).
+        steps: steps between two times that are asked for; for ``dopri5`` the first step that it tries is that long;
+            n for ``squaring``.
         atol: error allowed in one step of ``dopri5``, in voxels, at the worst node of the batch.
         adjoint: take gradients from the adjoint equation, solved backwards in time with as many steps (by ``rk4`` if
             the method is ``dopri5``): memory does not grow with the steps, the gradient has the error of the method.
@@ -43,11 +71,13 @@ class OdeSolver:
     adjoint: bool = False
 
     def __post_init__(self) -> None:
-        require_choice(self.method, (*FIXED_STEP, *ADAPTIVE), "integrate: method")
+        require_choice(self.method, METHODS, "integrate: method")
         if not isinstance(self.steps, int) or self.steps < 1:
             raise InputError(f"integrate: steps must be a whole number, at least 1, got {self.steps!r}")
         if not (math.isfinite(self.atol) and self.atol > 0):
             raise InputError(f"integrate: atol must be a positive number of voxels, got {self.atol!r}")
+        if self.adjoint and self.method == "squaring":
+            raise InputError("integrate: squaring has no adjoint equation; take method='rk4'")
 
 
 def integrate(
@@ -66,7 +96,7 @@ def integrate(
         v: velocity ``(B, D, *S)`` in units of spacing per unit of time.
         grid: its grid.
         steps: as `OdeSolver`, likewise ``method``, ``atol`` and ``adjoint``.
-        method: ``euler``, ``midpoint``, ``rk4`` or ``dopri5``.
+        method: ``euler``, ``midpoint``, ``rk4``, ``dopri5`` or ``squaring``.
         time: how long v is followed; a negative time goes backwards, which gives the inverse map.
         atol: error allowed in one step of ``dopri5``, in voxels.
         adjoint: take gradients from the adjoint equation, so that memory does not grow with the steps.
@@ -80,22 +110,34 @@ def integrate(
 
     Notes:
         The order is that of the method until the linear interpolation of v, of second order in the spacing, dominates.
-        Costs one sampling of v per stage except the first, where the points are the nodes. A point that leaves Ω moves
-        with the velocity of the nearest boundary point and is put back on the boundary at the end, so φ maps Ω into Ω.
-        Differentiable in v.
+        Costs one sampling of v per stage except the first, where the points are the nodes; ``squaring`` one per
+        squaring, with error O(2⁻ⁿ) and that of n interpolations. A point that leaves Ω moves with the velocity of the
+        nearest boundary point and is put back on the boundary at the end, so φ maps Ω into Ω. Differentiable in v.
     """
     grid.check_vector(v, "integrate: v")
     if not math.isfinite(time):
         raise InputError(f"integrate: time must be finite, got {time!r}")
-    solver = OdeSolver(method=method, steps=steps, atol=atol, adjoint=adjoint)
-    velocity, nodes = (v if time > 0 else -v), torch.zeros_like(v)
-    if time == 0:
-        return nodes
+    return flow(v, grid, OdeSolver(method=method, steps=steps, atol=atol, adjoint=adjoint), time=time)
 
-    def rate(_: Tensor, u: Tensor) -> Tensor:
+
+def flow(v: Tensor, grid: Grid, solver: OdeSolver, *, time: float = 1.0) -> Tensor:
+    """Return what `integrate` does with the options of ``solver``; arguments as there."""
+    if time == 0:
+        return torch.zeros_like(v)
+    if solver.method == "squaring":
+        return _square(v * (time / 2**solver.steps), grid, solver.steps)
+    velocity, nodes = (v if time > 0 else -v), torch.zeros_like(v)
+
+    def rate(_: Any, u: Tensor) -> Tensor:
         return velocity if u is nodes else warp(velocity, u, grid)
 
-    u = _solve(rate, nodes, (0.0, abs(time)), grid, solver, (velocity,))[-1]
+    return keep_inside(integrate_rate(rate, nodes, (0.0, abs(time)), grid, solver, (velocity,))[-1], grid)
+
+
+def _square(u: Tensor, grid: Grid, times: int) -> Tensor:
+    """Compose id + u with itself, ``times`` times over."""
+    for _ in range(times):
+        u = compose(u, u, grid)
     return keep_inside(u, grid)
 
 
@@ -132,21 +174,34 @@ def integrate_points(
     steps = [b - a for a, b in pairwise(times)]
     if not steps or not (all(step > 0 for step in steps) or all(step < 0 for step in steps)):
         raise InputError(f"integrate_points: times must be two or more, increasing or decreasing, got {list(times)}")
-    trajectory = _solve(rate, points, times, grid, solver or OdeSolver(), parameters)
+    trajectory = integrate_rate(rate, points, times, grid, solver or OdeSolver(), parameters)
     farthest = grid.along(grid.extent, points).view(-1, *([1] * (points.dim() - 2)))
     return trajectory.clamp(min=0.0).clamp(max=farthest)
 
 
-def _solve(
-    rate: Rate, start: Tensor, times: Sequence[float], grid: Grid, solver: OdeSolver, parameters: Sequence[Tensor]
+def integrate_rate(
+    rate: Rate,
+    start: Tensor,
+    times: Sequence[float],
+    grid: Grid,
+    solver: OdeSolver,
+    parameters: Sequence[Tensor] = (),
 ) -> Tensor:
-    """Return the states at the times, ``(len(times), *start.shape)``."""
+    """Return the states y(t) at the times, ``(len(times), *start.shape)``, where dy/dt = rate(t, y), unclamped.
+
+    Arguments and errors are those of `integrate_points`, but the state may be anything ``(B, D, *T)``.
+    """
+    if solver.method == "squaring":
+        raise InputError("integrate: squaring follows a stationary velocity only; take method='rk4'")
+    if torch.compiler.is_compiling() and solver.method in TABLEAUX and not solver.adjoint:
+        return runge_kutta(rate, start, times, TABLEAUX[solver.method], solver.steps)
     from torchdiffeq import odeint, odeint_adjoint
 
     t = torch.tensor(times, dtype=start.dtype, device=start.device)
-    fixed = {"method": solver.method, "options": {"grid_constructor": _equal_steps(solver.steps)}}
+    options = {"grid_constructor": _equal_steps(solver.steps)} if solver.steps > 1 else {}
+    fixed = {"method": solver.method, "options": options}
     settings = fixed if solver.method in FIXED_STEP else _adaptive(start, times, grid, solver)
-    backward = {} if settings is fixed else {"adjoint_method": "rk4", "adjoint_options": fixed["options"]}
+    backward = {} if settings is fixed else {"adjoint_method": "rk4", "adjoint_options": options}
     try:
         if solver.adjoint:
             states: Any = odeint_adjoint(rate, start, t, **settings, **backward, adjoint_params=tuple(parameters))
@@ -158,6 +213,34 @@ def _solve(
             "check the velocity for NaN and infinity, or raise atol"
         ) from error
     return states
+
+
+def runge_kutta(rate: Rate, start: Tensor, times: Sequence[float], tableau: Tableau, steps: int) -> Tensor:
+    """Return the states at the times, ``(len(times), *start.shape)``, with ``steps`` equal steps between any two."""
+    states = [start]
+    for begin, end in pairwise(times):
+        state, h = states[-1], (end - begin) / steps
+        for step in range(steps):
+            slopes: list[Tensor] = []
+            for row in tableau.stages:
+                time = begin + (step + sum(row)) * h
+                slopes.append(rate(time, _moved(state, slopes, row, h)))
+            state = _moved(state, slopes, tableau.weights, h)
+        states.append(state)
+    return torch.stack(states)
+
+
+def _moved(state: Tensor, slopes: Sequence[Tensor], weights: Sequence[float], h: float) -> Tensor:
+    """Return state + h Σ weight · slope; the state itself where there are none."""
+    for slope, weight in zip(slopes, weights, strict=True):
+        if weight:
+            state = state + slope * (weight * h)
+    return state
+
+
+def preload() -> None:
+    """Import torchdiffeq, which takes half a second, in a thread of its own beside what comes first."""
+    threading.Thread(target=import_module, args=("torchdiffeq",), daemon=True).start()
 
 
 def _equal_steps(steps: int) -> Callable[[Rate, Tensor, Tensor], Tensor]:

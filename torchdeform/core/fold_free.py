@@ -1,4 +1,10 @@
-"""Steps that keep a map open: every one is looked at by the full certificate, and shortened where it is too bold."""
+"""Maps stay without folds: one guard that shortens a move, and one repair for maps that folded all the same.
+
+Both look at the one-sided determinants of `diagnostics`, whose positivity at every node is the certificate.
+"""
+
+from collections.abc import Callable
+from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -7,61 +13,41 @@ from torch import Tensor
 from torchdeform.core.derivatives import jacobian_determinant
 from torchdeform.core.diagnostics import one_sided_determinant
 from torchdeform.core.grid import Grid, per_item
-from torchdeform.core.warp import compose, keep_inside, warp
+from torchdeform.errors import ComputationError
 
-# Rounds of smoothing that a few folded nodes are given to open.
-_SMOOTHINGS = 100
+Trial = TypeVar("Trial")
+
+# Rounds of smoothing: so many for the floor that is asked for, and for no folds at all. 50 is the most that was seen.
+_FLOOR_ROUNDS, _ROUNDS = 100, 1000
 
 _WIDEN = {2: F.max_pool2d, 3: F.max_pool3d}
 
-# A step that is still too bold at this fraction of itself is not taken.
-_SHORTEST = 2.0**-6
 
-
-def advance(
-    state: tuple[Tensor, Tensor], move: Tensor, share: Tensor, grid: Grid, limit: float, sides: int = 1
-) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Return u ∘ flow(move), relaxed, its `one_sided_determinant`, which pairs moved, and how often a step was halved.
-
-    No determinant falls below ``limit``, or below the smallest one there was if that was less. Along the halvings the
-    trial tends to u, so a bold step ends as a short one. The extrapolated determinants on the faces of the box are left
-    to `mended`, after the last step: they take as long as all the others and hardly ever fold alone.
+@torch.no_grad()
+def largest_share(accept: Callable[[Tensor], Tensor], like: Tensor, *, halvings: int, refine: bool = False) -> Tensor:
+    """Return the largest share t of a move that is accepted, for each item ``(B,)``: 1, or found by halving.
 
     Args:
-        state: u ``(sides·B, D, *S)`` in units of spacing, and its `one_sided_determinant`.
-        move: velocity, the same shape.
-        share: of the way to its `neighbour_mean` that the new u is taken, for each map ``(sides·B,)``, see `relaxed`.
-        grid: the grid of both.
-        limit: smallest one-sided determinant that may be left.
-        sides: maps of one pair, B items apart; they are shortened together.
+        accept: tells which items ``(B,)`` may make their share ``(B,)`` of the move. Called with shares that fall from
+            1; those of items that are settled stay as they are, so the last call shows every accepted move at once.
+        like: ``(B,)``, for the type and device of the shares.
+        halvings: how often the share is halved, at most.
+        refine: go on by bisection up to a multiple of 2^−halvings; then the last call shows trials, not the answer.
+
+    Returns:
+        ``(B,)``: t = 1, 1/2, .., 2^−halvings, a multiple of the last with ``refine``; 0 where nothing was accepted.
+
+    Notes:
+        At most ``halvings`` + 1 calls. What is not finite is never accepted, if ``accept`` compares with ≥ or >.
     """
-    u, lowest = state
-    floor = lowest.flatten(1).amin(1).clamp(max=limit)
-    fraction, halved = torch.ones_like(floor), 0
-    while True:
-        trial = relaxed(compose(u, _flow(move * per_item(fraction, u), grid), grid), share * fraction, grid)
-        trial_lowest = one_sided_determinant(trial, grid)
-        low = _any_side(~(trial_lowest.flatten(1).amin(1) >= floor), sides)
-        count = int(low.sum()) // sides
-        if count == 0:
-            return trial, trial_lowest, ~low[: low.numel() // sides], halved
-        if bool((fraction[low] <= _SHORTEST).all()):
-            u, lowest = keep(~low, trial, u), keep(~low, trial_lowest, lowest)
-            return u, lowest, ~low[: low.numel() // sides], halved
-        halved += count
-        fraction = torch.where(low, fraction / 2, fraction)
-
-
-def _flow(v: Tensor, grid: Grid) -> Tensor:
-    """Return the displacement of the flow of v at t = 1 by one step of the midpoint rule, kept in Ω.
-
-    What `integrate` gives, without the general solver: its import alone takes as long as a pair of small slices.
-    """
-    return keep_inside(warp(v, v / 2, grid), grid)
-
-
-def _any_side(per_map: Tensor, sides: int) -> Tensor:
-    return per_map if sides == 1 else per_map.view(sides, -1).any(0).repeat(sides)
+    share = torch.zeros_like(like)
+    for halving in range(halvings + 1):
+        settled = (share == 1) if refine else (share > 0)
+        trial = torch.where(settled, share, share + 0.5**halving)
+        share = torch.where(accept(trial), trial, share)
+        if bool((share == 1).all() if refine else (share > 0).all()):
+            break
+    return share
 
 
 def lowest_determinant(u: Tensor, grid: Grid) -> Tensor:
@@ -71,6 +57,8 @@ def lowest_determinant(u: Tensor, grid: Grid) -> Tensor:
     """
     lowest = one_sided_determinant(u, grid)
     for axis, n in zip(grid.axes, grid.shape, strict=True):
+        if n < 3:
+            continue
         layers = torch.cat([u.narrow(axis, 0, 3), u.narrow(axis, n - 3, 3)])
         first, last = jacobian_determinant(layers, Grid(tuple(layers.shape[2:]), grid.spacing)).chunk(2)
         for node, det in ((0, first), (n - 1, last)):
@@ -79,29 +67,48 @@ def lowest_determinant(u: Tensor, grid: Grid) -> Tensor:
     return lowest
 
 
-def mended(u: Tensor, grid: Grid, limit: float = 0.0) -> Tensor:
-    """Return u, smoothed around the nodes whose `lowest_determinant` is not above ``limit``, until there are none.
+def repair_folds(u: Tensor, grid: Grid, floor: float = 0.0) -> Tensor:
+    """Return u, smoothed around the nodes whose `lowest_determinant` is not above ``floor``, until there are none.
 
-    Sampling an open map on another grid, or composing two, may fold it at a few nodes. All others stay as they are, and
-    so do the faces of the box. Nodes that no smoothing opens draw their whole item towards 0.
+    Sampling a map on another grid, composing two, or a flow that bends within a cell may fold a map at a few nodes.
+    All others stay as they are, and so do the components that lead out of the box at its faces.
 
     Args:
         u: displacement ``(B, D, *S)`` in units of spacing.
         grid: its grid.
-        limit: at least 0.
+        floor: at least 0; where 100 rounds do not reach it, no folds are enough.
+
+    Returns:
+        ``(B, D, *S)``, the same tensor where nothing was folded.
+
+    Raises:
+        InputError: shape.
+        ComputationError: u is not finite, or there are still folds after 1000 rounds.
+
+    Notes:
+        Each round moves the nodes around all folds seen so far towards the mean of their neighbours, by a share that
+        fades out over a few cells; continued for ever, that would end in the identity. Differentiable in u for the
+        nodes that are moved.
     """
-    for _ in range(_SMOOTHINGS):
-        low = ~(lowest_determinant(u, grid) > limit)
-        if not bool(low.any()):
+    grid.check_vector(u, "repair_folds: u")
+    share, least = torch.zeros_like(u[:, :1]), 16 * torch.finfo(u.dtype).eps  # positive also with other rounding
+    for step in range(_ROUNDS):
+        folded = ~(lowest_determinant(u.detach(), grid) > max(least, floor if step < _FLOOR_ROUNDS else 0.0))
+        if not bool(folded.any()):
             return u
-        near = neighbour_mean(_WIDEN[grid.dim](low.to(u.dtype), 3, stride=1, padding=1))
-        u = _keep_faces(torch.lerp(u, neighbour_mean(u), near), u, grid)
-    while bool((low := ~(lowest_determinant(u, grid).flatten(1).amin(1) > 0)).any()):
-        u = torch.where(per_item(low, u), 0.9 * u, u)
-    return u
+        if step == 0 and not bool(u.isfinite().all()):
+            raise ComputationError("the map is not finite; check the images for extreme values, or take smaller steps")
+        wider = _WIDEN[grid.dim](folded.to(u.dtype), 5, stride=1, padding=2)
+        share = torch.maximum(share, wider)
+        fading = neighbour_mean(neighbour_mean(share))
+        u = keep_faces(torch.lerp(u, neighbour_mean(u), fading.expand_as(u)), u, grid)
+    raise ComputationError(
+        f"the map still folds after {_ROUNDS} rounds of smoothing: it varies too much for this grid; take smoother "
+        "settings or a finer grid (for a monitor: smooth it, or raise f_min)"
+    )
 
 
-def relaxed(u: Tensor, share: Tensor, grid: Grid) -> Tensor:
+def smooth_elastically(u: Tensor, share: Tensor, grid: Grid) -> Tensor:
     """Return u + share (ū − u), ū being its `neighbour_mean`: diffusion ∂u/∂t = Δu for share / 4 squared voxels.
 
     A step down the elastic energy ½ ∫ |∇u|², which prices the whole displacement as the metric prices the velocity.
@@ -111,7 +118,7 @@ def relaxed(u: Tensor, share: Tensor, grid: Grid) -> Tensor:
         share: 0 to 1 for each item ``(B,)``.
         grid: its grid.
     """
-    return _keep_faces(torch.lerp(u, neighbour_mean(u), per_item(share, u)), u, grid) if bool(share.any()) else u
+    return keep_faces(torch.lerp(u, neighbour_mean(u), per_item(share, u)), u, grid)
 
 
 def neighbour_mean(field: Tensor) -> Tensor:
@@ -124,14 +131,14 @@ def neighbour_mean(field: Tensor) -> Tensor:
     return field
 
 
-def _keep_faces(u: Tensor, before: Tensor, grid: Grid) -> Tensor:
-    """Give the components that lead out of the box at its faces the values they had."""
+def keep_faces(u: Tensor, before: Tensor, grid: Grid) -> Tensor:
+    """Give the components that lead out of the box at its faces the values they had, in place."""
     for k, axis in enumerate(grid.axes):
         for end in (0, -1):
             u[:, k].select(axis - 1, end).copy_(before[:, k].select(axis - 1, end))
     return u
 
 
-def keep(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """Return the new items that are chosen, and the old ones in place of the others."""
+def where_items(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """Return the new items that are chosen ``(B,)``, and the old ones in place of the others."""
     return new if bool(chosen.all()) else torch.where(per_item(chosen, new), new, old)

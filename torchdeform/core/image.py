@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from itertools import product
 
 import torch
 from torch import Tensor
@@ -110,6 +109,28 @@ def same_place(a: Image, b: Image) -> bool:
     return (a.grid, a.origin, a.direction) == (b.grid, b.origin, b.direction)
 
 
+def box_corners(grid: Grid) -> Tensor:
+    """Return the corners of the box of a grid ``(1, D, 2^D)``, float64, the first and the last opposite each other."""
+    ends = [torch.tensor([0.0, side], dtype=torch.float64) for side in grid.extent]
+    return torch.cartesian_prod(*ends).T.unsqueeze(0)
+
+
+def background(data: Tensor) -> Tensor:
+    """Return the grey value of the background, the median over the faces of the box of ``(1, C, *S)``."""
+    faces = [data.select(axis, end).flatten() for axis in range(2, data.dim()) for end in (0, -1)]
+    return torch.cat(faces).median()
+
+
+def centre_of_mass(image: Image, weight: Tensor) -> Tensor:
+    """Return the mean position of an image's nodes ``(1, D)`` in the world, float64, weighted by ``(1, 1, *S)``.
+
+    The weights are not negative; where all are 0 it is the origin of the world.
+    """
+    world = image.to_world(image.grid.points(dtype=torch.float64, device=weight.device)).flatten(2)
+    weight = weight.double().flatten(2)
+    return (world * weight).sum(2) / weight.sum().clamp(min=torch.finfo(torch.float64).tiny)
+
+
 def luminance(image: Image) -> Image:
     """Return the grey image that colour is registered on, Y = 0.299 R + 0.587 G + 0.114 B; grey images as they are.
 
@@ -157,8 +178,8 @@ def require_same_place(image: Image, other: Image, *, atol: float = 1e-3) -> Non
     if image.grid.shape != other.grid.shape:
         sizes = f"{'×'.join(map(str, image.grid.shape[::-1]))} and {'×'.join(map(str, other.grid.shape[::-1]))}"
         raise InputError(f"{image.name} and {other.name} must lie on one grid, but have {sizes} nodes; resample one")
-    corners = torch.tensor(list(product(*((0.0, side) for side in image.grid.extent))), dtype=torch.float64).T[None]
-    apart = (image.to_world(corners) - other.to_world(corners)).norm(dim=1).max()
+    ends = box_corners(image.grid)
+    apart = (image.to_world(ends) - other.to_world(ends)).norm(dim=1).max()
     if float(apart) > atol * min(other.grid.spacing):
         raise InputError(
             f"{image.name} and {other.name} must lie in one place, but their headers put them {float(apart):.3g} mm "

@@ -7,16 +7,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.core.image import Image, luminance, opaque
+from torchdeform.core.resampling import LINEAR_MODES
 from torchdeform.errors import InputError
 
-# Values sorted to find the scale of one channel.
+# Values of one channel that its percentiles are taken from, at most.
 _SAMPLES = 2**20
 
-# Percentiles that become 0 and 1.
-_LOW, _HIGH = 0.005, 0.995
-
 _POOL = {2: F.avg_pool2d, 3: F.avg_pool3d}
-_INTERPOLATION = {2: "bilinear", 3: "trilinear"}
 
 
 def corresponding_channels(fixed: Image, moving: Image) -> tuple[Image, Image]:
@@ -63,8 +60,25 @@ def _fill(image: Tensor, known: Tensor) -> Tensor:
     share = pool(weight, cell, ceil_mode=True)
     mean = pool(image * weight, cell, ceil_mode=True) / share.clamp(min=torch.finfo(image.dtype).tiny)
     coarse = _fill(mean, share > 0)
-    spread = F.interpolate(coarse, size=image.shape[2:], mode=_INTERPOLATION[image.dim() - 2], align_corners=False)
-    return torch.where(known, image, spread)
+    finer = F.interpolate(coarse, size=image.shape[2:], mode=LINEAR_MODES[image.dim() - 2], align_corners=False)
+    return torch.where(known, image, finer)
+
+
+def intensity_range(values: Tensor, *, low: float = 0.005, high: float = 0.995) -> Tensor:
+    """Return two percentiles of each row of values, or its extremes where these are equal.
+
+    Args:
+        values: ``(C, n)``, finite.
+        low: the lower percentile, 0 to 1.
+        high: the higher one.
+
+    Returns:
+        ``(2, C)``: values of the rows, taken at regular steps where there are more than a million.
+    """
+    values = values[:, :: max(1, values.shape[1] // _SAMPLES)]
+    ranks = (1 + round(share * (values.shape[1] - 1)) for share in (low, high))
+    ends = torch.stack([values.kthvalue(rank, dim=1).values for rank in ranks])  # quantile() stops at 2^24 values
+    return torch.where(ends[1] > ends[0], ends, torch.stack(values.aminmax(dim=1)))
 
 
 def to_common_scale(
@@ -86,10 +100,10 @@ def to_common_scale(
     values = [_inside(image, mask) for image, mask in zip(images, masks, strict=True)]
     if jointly:
         joined = [torch.cat(pair, dim=1) for pair in zip(*values, strict=True)]
-        spans = [_spans(joined, "fixed and moving")] * 2
+        ranges = [_ranges(joined, "fixed and moving")] * 2
     else:
-        spans = [_spans(own, name) for own, name in zip(values, ("fixed", "moving"), strict=True)]
-    fixed, moving = (_scaled(image, span) for image, span in zip(images, spans, strict=True))
+        ranges = [_ranges(items, name) for items, name in zip(values, ("fixed", "moving"), strict=True)]
+    fixed, moving = (_scaled(image, ends) for image, ends in zip(images, ranges, strict=True))
     return fixed, moving
 
 
@@ -101,21 +115,14 @@ def _inside(image: Tensor, mask: Tensor | None) -> list[Tensor]:
     return [item[:, where] for item, where in zip(image.flatten(2), known, strict=True)]
 
 
-def _spans(items: list[Tensor], name: str) -> Tensor:
-    """Return lowest and highest percentile of every channel, ``(2, B, C)``."""
-    spans = torch.stack([_span(values) for values in items], dim=1)
-    if not bool((spans[1] > spans[0]).any(1).all()):
+def _ranges(items: list[Tensor], name: str) -> Tensor:
+    """Return both ends of the `intensity_range` of every channel, ``(2, B, C)``."""
+    ranges = torch.stack([intensity_range(values) for values in items], dim=1)
+    if not bool((ranges[1] > ranges[0]).any(1).all()):
         raise InputError(f"register: {name} is constant, so there is nothing to align")
-    return spans
+    return ranges
 
 
-def _span(values: Tensor) -> Tensor:
-    values = values[:, :: max(1, values.shape[1] // _SAMPLES)].sort(dim=1).values  # quantile() stops at 2^24 values
-    last = values.shape[1] - 1
-    low, high = values[:, round(_LOW * last)], values[:, round(_HIGH * last)]
-    return torch.where(high > low, torch.stack([low, high]), torch.stack([values[:, 0], values[:, -1]]))
-
-
-def _scaled(image: Tensor, span: Tensor) -> Tensor:
-    low, high = (end.view(*end.shape, *([1] * (image.dim() - 2))) for end in span)
+def _scaled(image: Tensor, ends: Tensor) -> Tensor:
+    low, high = (end.view(*end.shape, *([1] * (image.dim() - 2))) for end in ends)
     return (image - low).div_(torch.where(high > low, high - low, 1))

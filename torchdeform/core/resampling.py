@@ -264,7 +264,8 @@ _MIN_LONGEST = 16
 # Standard deviation of the smoothing before a level, in voxels of that level.
 _BLUR = 0.5
 
-_INTERPOLATION = {2: "bilinear", 3: "trilinear"}
+# The word for linear interpolation in `F.interpolate`, by dimension.
+LINEAR_MODES = {2: "bilinear", 3: "trilinear"}
 
 
 def pyramid_grids(grid: Grid, levels: int) -> list[Grid]:
@@ -323,4 +324,4 @@ def prolong(u: Tensor, grid: Grid) -> Tensor:
     """
     if tuple(u.shape[2:]) == grid.shape:
         return u
-    return F.interpolate(u, size=grid.shape, mode=_INTERPOLATION[grid.dim], align_corners=True)
+    return F.interpolate(u, size=grid.shape, mode=LINEAR_MODES[grid.dim], align_corners=True)

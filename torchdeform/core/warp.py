@@ -11,9 +11,9 @@ from torch import Tensor
 
 from torchdeform.core.derivatives import LEAST_ROWS, cofactors, derivative, determinant, map_jacobian, slab_of
 from torchdeform.core.grid import Grid, over_slabs
+from torchdeform.core.resampling import LINEAR_MODES
 from torchdeform.errors import InputError, require_choice
 
-_RESIZE = {2: "bilinear", 3: "trilinear"}
 _MODES = {"linear": "bilinear", "nearest": "nearest"}
 
 # Fewer points than this are not worth more than one thread.
@@ -258,7 +258,7 @@ def _find_inverse(u: Tensor, grid: Grid, atol: float, max_steps: int) -> Tensor:
 
 
 def _resized(u: Tensor, grid: Grid) -> Tensor:
-    return F.interpolate(u, size=grid.shape, mode=_RESIZE[grid.dim], align_corners=True)
+    return F.interpolate(u, size=grid.shape, mode=LINEAR_MODES[grid.dim], align_corners=True)
 
 
 def _approach(u: Tensor, w: Tensor, grid: Grid, atol: float) -> Tensor:

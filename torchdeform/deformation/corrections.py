@@ -1,25 +1,22 @@
-"""What is done to a map at the end: its determinants on the grid are set right, folds between nodes taken out."""
+"""Defect correction: the determinants of a map on its grid are brought nearer to those that were prescribed."""
 
 import torch
 from torch import Tensor
 
 from torchdeform.core.derivatives import determinant, jacobian, map_jacobian
-from torchdeform.core.diagnostics import one_sided_determinant, smallest_determinant
-from torchdeform.core.grid import Grid
+from torchdeform.core.diagnostics import smallest_determinant
+from torchdeform.core.fold_free import largest_share
+from torchdeform.core.grid import Grid, per_item
 from torchdeform.core.warp import warp
 from torchdeform.deformation.velocity import mode_angles, potential_velocity
-from torchdeform.errors import ComputationError
 from torchdeform.fem.boundary import fixed_unknowns
 
-# A correction that would fold, or miss by more than before, is shortened to these shares of it; then it is left out.
-_SHARES = (1.0, 0.5, 0.25)
+# A correction that would fold, or miss by more than before, is halved so often; then it is left out.
+_HALVINGS = 2
 
 # By how much the mean of |J ρ1/ρ0 − 1| may grow while the variance of the quotient falls: a map has the same mean of J
 # whatever slides, so errors of the mean are not for a correction to mend.
 _SLACK = 1.05
-
-# Nodes are moved to the middle of their neighbours this often at most; 50 times is the most that has been seen.
-_MAX_ROUNDS = 1000
 
 # Weight of second differences in `_slide`. Smaller follows finer errors, larger is smoother; see there.
 _DAMPING = 0.1
@@ -52,25 +49,24 @@ def correct_determinant(u: Tensor, start: Tensor, end: Tensor, grid: Grid) -> Te
     defect = start - determinant(gradient) * _moved(end, u, grid)
     slide = _slide(defect, grid) / start
     move = _tangential((gradient * slide.unsqueeze(1)).sum(dim=2), grid)
-    return u + _longest_share(u, move, start, end, grid) * move
+    return u + _open_share(u, move, start, end, grid) * move
+
+
+def _open_share(u: Tensor, move: Tensor, start: Tensor, end: Tensor, grid: Grid) -> Tensor:
+    """Return the share of the move, halved twice at most, that folds nowhere and makes the error smaller, else 0."""
+    variance, mean = _errors(u, start, end, grid)
+    least = 16 * torch.finfo(u.dtype).eps  # positive also when it is computed again with other rounding
+
+    def accept(share: Tensor) -> Tensor:
+        moved = u + per_item(share, u) * move
+        new_variance, new_mean = _errors(moved, start, end, grid)
+        better = (new_variance < variance) & (new_mean < _SLACK * mean)
+        return better & (smallest_determinant(moved, grid) > least)
+
+    return per_item(largest_share(accept, variance, halvings=_HALVINGS), u)
 
 
 @torch.no_grad()
-def _longest_share(u: Tensor, move: Tensor, start: Tensor, end: Tensor, grid: Grid) -> Tensor:
-    """Return the first of `_SHARES` that leaves each item without folds and with a smaller error, else 0."""
-    share = u.new_zeros(u.shape[0])
-    variance, mean = _errors(u, start, end, grid)
-    for trial in _SHARES:
-        moved = u + trial * move
-        new_variance, new_mean = _errors(moved, start, end, grid)
-        better = (new_variance < variance) & (new_mean < _SLACK * mean)
-        good = better & (smallest_determinant(moved, grid) > _least(u))
-        share = torch.where((share == 0) & good, trial, share)
-        if bool((share > 0).all()):
-            break
-    return share.view(-1, *[1] * (grid.dim + 1))
-
-
 def _errors(u: Tensor, start: Tensor, end: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
     """Return for each item the variance of q = J(φ) ρ1(φ)/ρ0 and the mean of |q − 1|."""
     quotient = determinant(map_jacobian(u, grid)) * _moved(end, u, grid) / start
@@ -107,65 +103,6 @@ def _moved(density: Tensor, u: Tensor, grid: Grid) -> Tensor:
     return value.clamp(low / 2, high * 2)
 
 
-def remove_folds(u: Tensor, grid: Grid) -> Tensor:
-    """Return u with the nodes around folds moved to the middle of their neighbours until φ = id + u has no folds.
-
-    Args:
-        u: displacement ``(B, D, *S)`` in units of spacing, n·u = 0 on the boundary.
-        grid: its grid.
-
-    Returns:
-        ``(B, D, *S)``, a digital diffeomorphism; the same numbers where the nodes within some cells have no folds.
-
-    Raises:
-        InputError: shape.
-        ComputationError: there are still folds after 1000 rounds, or u is not finite.
-
-    Notes:
-        The flow of a velocity does not fold, but where a map bends within a cell the simplices between its nodes may.
-        Each round moves the nodes around the folds seen so far by a share that fades out over a few cells towards the
-        mean of their neighbours; continued for ever, that would end in the identity. Differentiable in u for the nodes
-        that are moved.
-    """
-    share = torch.zeros_like(u[:, :1])
-    for _ in range(_MAX_ROUNDS):
-        folded = ~(one_sided_determinant(u, grid) > _least(u))
-        if not bool(folded.any()):
-            return u
-        share = torch.maximum(share, _widen(_widen(folded.to(u.dtype), grid), grid))
-        fading = _middle(_middle(share, grid), grid)
-        u = u + _tangential(fading * (_middle(u, grid) - u), grid)
-    raise ComputationError(
-        f"the map still folds after {_MAX_ROUNDS} rounds of smoothing: the monitor varies too much for this grid; "
-        "smooth it, raise f_min, or take a finer grid"
-    )
-
-
-def _least(u: Tensor) -> float:
-    """What counts as no fold: positive also when it is computed again with other rounding."""
-    return 16 * torch.finfo(u.dtype).eps
-
-
 def _tangential(move: Tensor, grid: Grid) -> Tensor:
     """Return the move with the normal component on the boundary set to exactly zero."""
     return move.masked_fill(fixed_unknowns("slip", grid, move.device), 0)
-
-
-def _neighbours(x: Tensor, axis: int) -> tuple[Tensor, Tensor]:
-    """Return the values before and after each node along an axis, the ends being repeated."""
-    count = x.shape[axis] - 1
-    before = torch.cat([x.narrow(axis, 0, 1), x.narrow(axis, 0, count)], dim=axis)
-    return before, torch.cat([x.narrow(axis, 1, count), x.narrow(axis, count, 1)], dim=axis)
-
-
-def _widen(x: Tensor, grid: Grid) -> Tensor:
-    """Return the largest value among each node and its neighbours, diagonal ones included."""
-    for axis in grid.axes:
-        before, after = _neighbours(x, axis)
-        x = torch.maximum(x, torch.maximum(before, after))
-    return x
-
-
-def _middle(x: Tensor, grid: Grid) -> Tensor:
-    """Return the mean of the 2·D neighbours of each node."""
-    return torch.stack([near for axis in grid.axes for near in _neighbours(x, axis)]).mean(0)

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchdeform.core.derivatives import CURL_PAIRS, KERNELS, cofactors, jacobian
 from torchdeform.core.diagnostics import smallest_determinant
-from torchdeform.core.grid import Grid
+from torchdeform.core.fold_free import largest_share
+from torchdeform.core.grid import Grid, per_item
 from torchdeform.deformation.finite_differences import Differences, dots
 from torchdeform.deformation.monitors import require_positive
 from torchdeform.errors import InputError, require_choice
@@ -29,7 +30,7 @@ _STATIONARY = {torch.float32: 1e-4, torch.float64: 1e-10}
 _LEAST_SHARE = 0.1
 
 # Steps are halved this often at most.
-_HALVINGS = 12
+_HALVINGS = 11
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -316,17 +317,15 @@ class _Descent:
 
     def _search(self, before: _State, move: Tensor, gain: Tensor, index: Tensor) -> tuple[_State, Tensor]:
         """Return the state after the longest of the shares 1, 1/2, 1/4, .. of the step that will do, and the share."""
-        share, after = torch.ones_like(before.norm), before
-        open_ = torch.ones_like(share, dtype=torch.bool)
-        for _ in range(_HALVINGS):
-            trial = self.problem.look(before.u + share.view(-1, *[1] * (move.dim() - 1)) * move, index)
-            good = open_ & self._acceptable(before, trial, share * gain**2, index)
-            after = after.choose(good.nonzero().flatten(), trial.take(good))
-            open_ &= ~good
-            if not bool(open_.any()):
-                break
-            share = torch.where(open_, share / 2, share)
-        return after, share.masked_fill(open_, 0)
+        after = before
+
+        def accept(share: Tensor) -> Tensor:
+            nonlocal after
+            after = self.problem.look(before.u + per_item(share, move) * move, index)
+            return self._acceptable(before, after, share * gain**2, index)
+
+        share = largest_share(accept, before.norm, halvings=_HALVINGS)
+        return before.choose((share > 0).nonzero().flatten(), after.take(share > 0)), share
 
     def _acceptable(self, before: _State, after: _State, promise: Tensor, index: Tensor) -> Tensor:
         """Tell which items keep a little of what was promised for the squared residual, and their orientation."""

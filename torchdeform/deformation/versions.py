@@ -19,9 +19,10 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.flow import OdeSolver, integrate_points
+from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import max_voxels, sample
-from torchdeform.deformation.corrections import correct_determinant, remove_folds
+from torchdeform.deformation.corrections import correct_determinant
 from torchdeform.deformation.monitors import mean_value, normalise_monitor, require_positive
 from torchdeform.deformation.velocity import VelocityName, find_velocity
 from torchdeform.errors import ComputationError, InputError
@@ -210,7 +211,7 @@ def _finish(u: Tensor, start: Tensor, end: Tensor, grid: Grid, settings: Deforma
     if not bool(u.isfinite().all()):
         raise ComputationError("the flow is not finite: the monitor spans too many orders of magnitude; raise f_min")
     if settings.remove_folds:
-        u = remove_folds(u, grid)
+        u = repair_folds(u, grid)
     for _ in range(settings.corrections):
         u = correct_determinant(u, start, end, grid)
     return u

@@ -17,13 +17,11 @@ from torchdeform.deformation.finite_differences import dots
 from torchdeform.deformation.monitors import mean_value, smooth
 from torchdeform.deformation.versions import grid_from_initial_monitor
 from torchdeform.errors import ComputationError, InputError
-from torchdeform.fem.boundary import constrain, fixed_unknowns
-from torchdeform.fem.fast_transform import TransformSolver
-from torchdeform.fem.form import div_curl_form
-from torchdeform.fem.operator import apply_form, assemble_load
+from torchdeform.fem.boundary import fixed_unknowns
+from torchdeform.fem.solver import SolverSettings, solver_of
+from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
 from torchdeform.solvers.base import Solution, Status
-from torchdeform.solvers.cg import conjugate_gradient
 
 # Next to what must not move no velocity has both the divergence and the curl that are asked for: volumes come first.
 _AROUND_RIGID = Weights(div=10.0, curl=1.0)
@@ -290,15 +288,9 @@ def _flow_around(f: Tensor, rigid: Tensor, grid: Grid) -> Tensor:
 
 def _velocity_around(div: Tensor, fixed: Tensor, grid: Grid) -> Tensor:
     """Return v, zero where ``fixed (B, D, *S)``, that minimises ∫ w_div (div v − α)² + w_curl |curl v|²."""
-    form = div_curl_form(grid.dim, _AROUND_RIGID)
-    load = assemble_load(form[:1], div, grid).masked_fill(fixed, 0)
-    solver = TransformSolver(grid, _AROUND_RIGID, "slip", dtype=div.dtype, device=div.device)
-    solution = conjugate_gradient(
-        constrain(lambda v: apply_form(form, v, grid), fixed),
-        load,
-        preconditioner=constrain(solver.solve, fixed),
-        rtol=1e-4,
-    )
+    system = DivCurlSystem(grid, _AROUND_RIGID, "slip", fixed)
+    solver = solver_of(SolverSettings(rtol=1e-4), system).init(system, div)
+    solution = solver.solution(system.load(div=div))
     if not solution.ok:
         reason = next(status.value for status in solution.status if not status.ok)
         raise ComputationError(f"simulate_volume_change: no velocity around the rigid mask: {reason}")

@@ -1,8 +1,9 @@
-"""Finite elements: the div-curl least squares and the direct solver for it."""
+"""The div-curl least squares on Q1 elements: weak form, assembly, system, solvers."""
 
 from torchdeform.fem.boundary import Face
-from torchdeform.fem.div_curl import DivCurlSolution, SolverSettings, solve_div_curl
-from torchdeform.fem.fast_transform import TransformSolver
+from torchdeform.fem.div_curl import DivCurlSolution, solve_div_curl
+from torchdeform.fem.solver import SolverSettings
+from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
 
-__all__ = ["DivCurlSolution", "Face", "SolverSettings", "TransformSolver", "Weights", "solve_div_curl"]
+__all__ = ["DivCurlSolution", "DivCurlSystem", "Face", "SolverSettings", "Weights", "solve_div_curl"]

@@ -1,7 +1,6 @@
 """The assembled system as torch sparse matrices, for small grids, other solvers and tests."""
 
 import math
-import warnings
 
 import torch
 from torch import Tensor
@@ -29,7 +28,7 @@ def assemble(form: Form, grid: Grid, device: torch.device | str = "cpu") -> Tens
 
     Notes:
         Takes C²·4^D entries per element before they are added up: 576 in 3D, some 13 kB. Beyond 64³ take
-        `operator.apply_form`. A product with the matrix runs 25 times faster as CSR, see `to_csr`.
+        `operator.apply_form`. A product with the matrix runs 25 times faster as CSR, see `cg.to_csr`.
     """
     matrices = element_matrices(form, grid, device)
     if matrices.shape[0] != 1:
@@ -50,13 +49,6 @@ def element_unknowns(grid: Grid, count: int = 1) -> Tensor:
         nodes = nodes.unfold(axis, 2, 1)
     corners = nodes.flatten(grid.dim).flatten(0, grid.dim - 1).T
     return torch.cat([corners + k * math.prod(grid.shape) for k in range(count)])
-
-
-def to_csr(matrix: Tensor) -> Tensor:
-    """Return the matrix in compressed rows (torch says that its CSR is in beta; the parts used here are tested)."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return matrix.to_sparse_csr()
 
 
 def constrain_matrix(matrix: Tensor, fixed: Tensor) -> Tensor:

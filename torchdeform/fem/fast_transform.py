@@ -19,6 +19,7 @@ exactly for the discrete system.
 """
 
 import math
+from dataclasses import dataclass
 from functools import reduce
 
 import torch
@@ -27,58 +28,65 @@ from torch import Tensor
 from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.fem.boundary import Boundary, Face, fixes, resolve_boundary
+from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
+from torchdeform.solvers.base import Factor, Solution, Status
+from torchdeform.solvers.cg import DEFAULT_RTOL
 from torchdeform.solvers.sine_cosine import Kind, Kinds, separable_transform
 
 
-class TransformSolver:
+@dataclass(frozen=True)
+class FastTransform:
+    """The direct solver of a `DivCurlSystem`, or with ``approximate`` the nearest system that transforms can solve.
+
+    Args:
+        approximate: where the transforms do not invert K, invert a symmetric positive definite operator near it, made
+            of the mean weights: a preconditioner. Otherwise such a system is refused.
+        rtol: converged when ‖load − K v‖ ≤ max(rtol ‖load‖, atol); `DEFAULT_RTOL` of the dtype when None.
+        atol: absolute tolerance on the residual.
+    """
+
+    approximate: bool = False
+    rtol: float | None = None
+    atol: float = 0.0
+
+    def init(self, system: DivCurlSystem, like: Tensor) -> "TransformFactor":
+        """Return the factors for loads with the type and device of ``like``.
+
+        Raises:
+            InputError: the transforms are not exact for the system, see `transform_is_exact`.
+        """
+        if not (self.approximate or is_exact_for(system)):
+            raise InputError("solver: transform is not exact for these weights and faces; take auto or cg")
+        return TransformFactor(system, like, DEFAULT_RTOL[like.dtype] if self.rtol is None else self.rtol, self.atol)
+
+
+class TransformFactor(Factor):
     """Solve K v = load, K the Q1 matrix of ∫ w_div (div v)² + w_curl |curl v|² + w_zero |v|², by fast transforms.
 
     Args:
-        grid: the grid of v.
-        weights: constant over space (they may vary over the batch: shape ``(B, 1, *1)``).
-        boundary: as `resolve_boundary`; all values given are zero.
-        dtype: floating type of the loads to come.
-        device: their device.
-
-    Raises:
-        InputError: weights that vary over space or are out of range, an unknown boundary.
-
-    Attributes:
-        exact: True when `solve` is the inverse of K, see `transform_is_exact`. Otherwise it is a preconditioner: the
-            inverse of a symmetric positive definite operator near K.
+        system: grid, weights (their means where they vary over space) and boundary.
+        like: a tensor with the type and device of the loads to come.
+        rtol: relative tolerance that a solution is judged by.
+        atol: absolute tolerance.
 
     Notes:
         Factors are computed once. A solve costs 2·D transforms. Differentiable in the load to every degree, and in
-        weights that are tensors. A solver keeps working memory: use one per thread.
+        weights that are tensors. Keeps working memory: use one per thread.
     """
 
-    def __init__(
-        self,
-        grid: Grid,
-        weights: Weights,
-        boundary: Boundary = "slip",
-        *,
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str | None = None,
-    ) -> None:
-        weights.check(grid)
-        if not weights.constant:
-            raise InputError(
-                "TransformSolver: weights must not vary over space; Weights.mean() makes a preconditioner of them"
-            )
-        self.grid = grid
-        self.exact = transform_is_exact(grid, weights, boundary)
+    def __init__(self, system: DivCurlSystem, like: Tensor, rtol: float, atol: float) -> None:
+        grid, weights, boundary = system.grid, system.weights, system.boundary
+        self.system, self.grid, self.rtol, self.atol = system, grid, rtol, atol
         self.kinds = _kinds(resolve_boundary(boundary, grid.dim), grid.dim)
-        like = torch.empty(0, dtype=dtype, device=device)
-        symbols = [_Symbols(grid, axis, like) for axis in range(grid.dim)]
-        coupled = self.exact and not weights.isotropic
-        weights = weights.to(like)
+        self._like = self._workspace = like.detach().new_empty(0)
+        symbols = [_Symbols(grid, axis, self._like) for axis in range(grid.dim)]
+        weights = (weights if weights.constant else weights.mean()).to(self._like)
+        coupled = transform_is_exact(grid, weights, boundary) and not weights.isotropic
         self._modes = _CoupledModes(symbols, weights, self.kinds) if coupled else _ScalarModes(symbols, weights)
         self._needs_grad = any(w.requires_grad for w in weights.tensors)
-        self._like, self._workspace = like, like
 
-    def solve(self, load: Tensor, *, power: int = 1) -> Tensor:
+    def __call__(self, load: Tensor, *, power: int = 1) -> Tensor:
         """Return v = (M⁻¹K)^−power M⁻¹ load, M being the mass matrix; power 1 solves K v = load.
 
         Args:
@@ -92,14 +100,27 @@ class TransformSolver:
         Raises:
             InputError: shape, type or device of the load, or a power below 1.
         """
-        self.grid.check_vector(load, "TransformSolver.solve: load")
+        self.grid.check_vector(load, "FastTransform: load")
         if (load.dtype, load.device) != (self._like.dtype, self._like.device):
             made, got = (f"{t.dtype} on {t.device}" for t in (self._like, load))
-            raise InputError(f"TransformSolver.solve: made for {made}, got a load of {got}")
+            raise InputError(f"FastTransform: made for {made}, got a load of {got}")
         if power < 1:
-            raise InputError(f"TransformSolver.solve: power must be at least 1, got {power}")
-        modes = separable_transform(load, self.kinds, out=self._buffer(load))
-        return separable_transform(self._modes.divide(modes, power), self.kinds)
+            raise InputError(f"FastTransform: power must be at least 1, got {power}")
+        masked = self.system.also_fixed is not None
+        modes = separable_transform(self.system.free(load) if masked else load, self.kinds, out=self._buffer(load))
+        v = separable_transform(self._modes.divide(modes, power), self.kinds)
+        return self.system.free(v) if masked else v
+
+    def solution(self, load: Tensor) -> Solution:
+        """Return v, with the residual that rounding leaves."""
+        value = self(load)
+        with torch.no_grad():
+            free = self.system.free(load)
+            norm, left = (t.flatten(1).norm(dim=1) for t in (free, free - self.system.apply(value)))
+        met, finite = left <= torch.clamp(self.rtol * norm, min=self.atol), torch.isfinite(left)
+        status = tuple(_judge(*flags) for flags in zip(met.tolist(), finite.tolist(), strict=True))
+        steps = torch.zeros(load.shape[0], dtype=torch.int64, device=load.device)
+        return Solution(value, status, steps, torch.where(norm > 0, left / norm, 0))
 
     def _buffer(self, load: Tensor) -> Tensor | None:
         """Memory for the modes, kept as new pages cost a fifth of a solve; None where autograd holds on to them."""
@@ -111,8 +132,19 @@ class TransformSolver:
         return self._workspace
 
 
+def _judge(met: bool, finite: bool) -> Status:
+    if not finite:
+        return Status.NON_FINITE
+    return Status.CONVERGED if met else Status.ROUNDING
+
+
+def is_exact_for(system: DivCurlSystem) -> bool:
+    """Tell whether the transforms invert the matrix of a system, see `transform_is_exact`."""
+    return system.also_fixed is None and transform_is_exact(system.grid, system.weights, system.boundary)
+
+
 def transform_is_exact(grid: Grid, weights: Weights, boundary: Boundary) -> bool:
-    """Tell whether `TransformSolver` inverts K exactly.
+    """Tell whether `FastTransform` inverts K exactly.
 
     Args:
         grid: the grid of v.

@@ -1,4 +1,4 @@
-"""DICOM: one file, the series that a file belongs to, or a folder that holds one series; what is missing is named."""
+"""DICOM: one file, the series of a file, or a folder with one series. Errors name the slices that are missing."""
 
 import re
 from collections.abc import Sequence
@@ -13,42 +13,42 @@ from numpy.typing import NDArray
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import itk
-from torchdeform.io.files import beginning
-from torchdeform.io.validation import BROKEN_OFF
+from torchdeform.io.files import read_head
+from torchdeform.io.validation import DAMAGED
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
 
-# One file stands for its series when there are at least so many slices: fewer cannot be registered as a volume.
+# A file is read as its whole series when that has so many slices. With fewer it cannot be registered as a volume.
 VOLUME_SLICES = 8
 
 _MAGIC = 128, b"DICM"
-_UNEVEN = 0.1  # distances of neighbouring slices may differ by this share of a step
-_SHEAR = 0.01  # and slices may be shifted sideways by this share of a step
-_SAME = 1e-2  # mm; slices nearer than this are at the same place
+_UNEVEN = 0.1  # share of a step by which the distances of neighbouring slices may differ
+_SHEAR = 0.01  # share of a step by which neighbouring slices may be shifted sideways
+_SAME = 1e-2  # mm; slices closer than this are at the same position
 
 _POSITION, _SERIES, _TITLE, _FRAME_TIME = "0020|0032", "0020|000e", "0008|103e", ("0018|1063", "0018|1065")
 _MOMENT = ("0018|1060", "0008|0032")  # trigger time, acquisition time
-_PARTS = ("0018|0086", "0020|0100")  # echo, moment: what tells several volumes of one series apart
+_PARTS = ("0018|0086", "0020|0100")  # echo and time index, which distinguish volumes of one series
 
-# Kinds of DICOM files that hold no image: directories, presentation states, reports, documents, plans, raw data.
+# Kinds of DICOM files without an image: directories, presentation states, reports, documents, plans, raw data.
 _NO_IMAGE = re.compile(rb"1\.2\.840\.10008\.(1\.3\.10|5\.1\.4\.1\.1\.(11|88|104|66|481\.[3458])(\.|\0|$))")
 
 
 @dataclass(frozen=True)
 class Slice:
-    """What the header of one file tells.
+    """What the header of one file says.
 
     Attributes:
         path: the file.
-        series: what all slices of one volume share.
+        series: the values that all slices of one volume share.
         title: the series' description.
         size: pixels along x, y and z.
         position: world position of the first pixel, mm.
-        moment: when it was taken, as the header writes it.
+        moment: when it was acquired, as the header writes it.
         axes: world directions of x, y and z as columns ``(3, 3)``.
-        film: whether the frames of this file follow each other in time.
-        grey: whether pixels have one number.
+        cine: whether the frames of this file follow each other in time.
+        grey: whether a pixel is one number.
     """
 
     path: Path
@@ -58,7 +58,7 @@ class Slice:
     position: NDArray[np.float64]
     moment: tuple[str, ...]
     axes: NDArray[np.float64]
-    film: bool
+    cine: bool
     grey: bool
 
     @property
@@ -68,30 +68,30 @@ class Slice:
 
 
 def is_dicom(path: Path) -> bool:
-    """Return whether a file begins like DICOM, whatever its name."""
+    """Return whether a file has the magic bytes of DICOM, whatever its name."""
     start, magic = _MAGIC
-    return beginning(path, start + len(magic))[start:] == magic
+    return read_head(path, start + len(magic))[start:] == magic
 
 
 def read_file(path: Path) -> Image:
-    """Read a DICOM file: the volume of its series, or the file alone where the series is no volume.
+    """Read a DICOM file: the volume of its series, or the file alone if the series is no volume.
 
     Args:
         path: one file.
 
     Raises:
-        InputError: damaged, a film, or of a series with slices that are missing, doubled, uneven or sheared.
+        InputError: damaged, a cine, or of a series with slices that are missing, double, uneven or sheared.
 
     Notes:
-        The series is what lies in the same folder with the same series number, size, orientation and spacing. It is
-        no volume when it has fewer than 8 slices, or several frames at one position, as a beating heart has. To read
-        one slice of a volume, put it into a folder of its own.
+        The series is all files of the same folder with the same series number, size, orientation and spacing. It is
+        no volume if it has fewer than 8 slices, or several frames at one position (a beating heart). To read one
+        slice of a volume, put it into a folder of its own.
     """
     here = _header(path)
     if here is None:
         raise InputError(f"{path} holds no DICOM image; give an image file, or the folder of the series")
-    if here.film:
-        raise InputError(f"{path} is a film of {here.size[2]} frames; export one frame and give that")
+    if here.cine:
+        raise InputError(f"{path} is a cine of {here.size[2]} frames; export one frame and give that")
     if here.size[2] > 1 or _has_frames(series := _like(here)) or len(series) < VOLUME_SLICES:
         return itk.to_image(_load(path), str(path))
     return _volume(series, str(path))
@@ -101,7 +101,7 @@ def read_folder(folder: Path) -> Image:
     """Read the one DICOM series in a folder.
 
     Args:
-        folder: where the files are; what is no DICOM image is passed over.
+        folder: where the files are; files that are no DICOM image are skipped.
 
     Raises:
         InputError: no series or several, a series of several frames, or slices that do not make a volume.
@@ -113,7 +113,9 @@ def read_folder(folder: Path) -> Image:
         raise InputError(f"{folder} is a folder without DICOM images{_below(folder)}; give an image file")
     if len(groups) > 1:
         titles = ", ".join(f"'{g[0].title}' ({len(g)} files, {g[0].path.name} for one)" for g in groups.values())
-        raise InputError(f"{folder} holds {len(groups)} DICOM series: {titles}; give one file of the series wanted")
+        raise InputError(
+            f"{folder} holds {len(groups)} DICOM series: {titles}; give one file of the series that you want"
+        )
     (series,) = groups.values()
     if len(series) == 1:
         return read_file(series[0].path)
@@ -141,17 +143,17 @@ def _headers(folder: Path) -> list[Slice]:
 
 
 def _header(path: Path) -> Slice | None:
-    """Return what the header says, or None for DICOM files that hold no image."""
+    """Return what the header says, or None for a DICOM file without an image."""
     import SimpleITK as sitk
 
-    if _NO_IMAGE.search(beginning(path, 2048)):
+    if _NO_IMAGE.search(read_head(path, 2048)):
         return None
     reader = sitk.ImageFileReader()
     reader.SetImageIO("GDCMImageIO")
     reader.SetFileName(str(path))
     error = itk.quietly(reader.ReadImageInformation)
     if isinstance(error, RuntimeError):
-        raise InputError(f"{path} {BROKEN_OFF}") from error
+        raise InputError(f"{path} {DAMAGED}") from error
     return _slice(path, reader)
 
 
@@ -169,7 +171,7 @@ def _slice(path: Path, reader: "sitk.ImageFileReader") -> Slice:
         position=np.array(reader.GetOrigin()),
         moment=tuple(tags.get(tag, "") for tag in _MOMENT),
         axes=axes,
-        film=reader.GetSize()[2] > 1 and any(tag in tags for tag in _FRAME_TIME),
+        cine=reader.GetSize()[2] > 1 and any(tag in tags for tag in _FRAME_TIME),
         grey=reader.GetNumberOfComponents() == 1,
     )
 
@@ -185,13 +187,13 @@ def _steps(series: Sequence[Slice]) -> NDArray[np.float64]:
 
 
 def _has_frames(series: Sequence[Slice]) -> bool:
-    """Return whether positions repeat at different moments, or half again as many files as positions: no slip."""
+    """Return whether positions repeat on purpose: at different moments, or in half again as many files as positions."""
     again = [(one, two) for one, two in pairwise(_sorted(series)) if two.height - one.height <= _SAME]
     return any(one.moment != two.moment for one, two in again) or len(series) >= 1.5 * (len(_steps(series)) + 1)
 
 
 def _volume(series: Sequence[Slice], name: str) -> Image:
-    """Read the slices of one volume, its third axis being the normal of the slices."""
+    """Read the slices of one volume. Its third axis is the normal of the slices."""
     import SimpleITK as sitk
 
     slices = _sorted(series)
@@ -199,7 +201,7 @@ def _volume(series: Sequence[Slice], name: str) -> Image:
     reader = sitk.ImageSeriesReader()
     reader.SetFileNames([str(s.path) for s in slices])
     reader.SetImageIO("GDCMImageIO")
-    if slices[0].grey:  # each slice may have its own scale, and what the first one is stored in may not hold the others
+    if slices[0].grey:  # every slice may have its own scale, so the type of the first may be too small for the others
         reader.SetOutputPixelType(sitk.sitkFloat32)
     image = itk.quietly(reader.Execute)
     if isinstance(image, RuntimeError):
@@ -216,17 +218,17 @@ def _load(path: Path) -> "sitk.Image":
     try:
         return itk.load(path)
     except RuntimeError as error:
-        raise InputError(f"{path} {BROKEN_OFF}") from error
+        raise InputError(f"{path} {DAMAGED}") from error
 
 
 def _require_regular(slices: Sequence[Slice], name: str) -> float:
-    """Return the distance of the slices, `InputError` naming what does not fit."""
+    """Return the distance of the slices; an `InputError` names the slices that do not fit."""
     pairs = list(pairwise(slices))
     steps = np.array([after.height - before.height for before, after in pairs])
     for (before, after), gap in zip(pairs, steps, strict=True):
         if gap <= _SAME:
             names = f"{before.path.name} and {after.path.name}"
-            raise InputError(f"{name}: {names} are slices at the same place; remove one of them")
+            raise InputError(f"{name}: {names} are slices at the same position; remove one of them")
     step = float(np.median(steps))
     for (before, after), gap in zip(pairs, steps, strict=True):
         between = f"between {before.path.name} and {after.path.name}"

@@ -1,4 +1,4 @@
-"""Files, safely: results that appear whole or not at all, C libraries kept quiet."""
+"""Files: results that appear complete or not at all, and C libraries that print nothing."""
 
 import os
 import sys
@@ -14,63 +14,64 @@ _STDERR = threading.Lock()
 
 
 def suffix(path: Path) -> str:
-    """Return the lower-case ending of a file's name that tells its format, ``.nii.gz`` counting as one."""
+    """Return the lower-case ending of a file name that tells its format; ``.nii.gz`` counts as one ending."""
     endings = [s.lower() for s in path.suffixes]
     return "".join(endings[-2:]) if endings[-1:] == [".gz"] else "".join(endings[-1:])
 
 
 def stem(path: Path) -> str:
-    """Return a file's name without the ending that `suffix` gives."""
+    """Return a file name without the ending that `suffix` returns."""
     return path.name[: len(path.name) - len(suffix(path))] or path.name
 
 
-def beginning(path: Path, count: int) -> bytes:
+def read_head(path: Path, count: int) -> bytes:
     """Return the first bytes of a file."""
     with path.open("rb") as file:
         return file.read(count)
 
 
 @contextmanager
-def staged(folder: Path) -> Iterator[Path]:
-    """Yield an empty folder whose files move into ``folder`` at the end, or vanish if anything went wrong.
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """Yield an empty folder whose files move into ``folder`` at the end, or are deleted after an error.
 
     Args:
-        folder: where the files shall be; made if need be. Files of the same names are replaced, others left alone.
+        folder: where the files go; created if missing. Files of the same names are replaced, others stay.
 
     Raises:
         InputError: nothing can be written there.
 
     Notes:
-        Every file is renamed when all are complete, on the same file system, so none is ever seen half-written.
+        The files are renamed once all are complete. Both folders are on one file system, so a rename is atomic and
+        nobody sees a half-written file.
     """
-    try:
-        holder = tempfile.TemporaryDirectory(prefix=".torchdeform-", dir=_nearest_folder(folder))
-    except OSError as error:
-        raise InputError(f"cannot write to {folder}: {error.strerror}; choose another folder") from error
-    with holder as temporary:
+    with _temporary_folder(folder) as temporary:
         yield Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
         for file in sorted(Path(temporary).iterdir()):
             file.replace(folder / file.name)
 
 
+def require_writable(folder: Path) -> None:
+    """Raise `InputError` unless files can be written into ``folder``, which may be missing; leaves nothing behind."""
+    _temporary_folder(folder).cleanup()
+
+
+def _temporary_folder(folder: Path) -> "tempfile.TemporaryDirectory[str]":
+    """Return a new temporary folder on the file system of ``folder``."""
+    try:
+        return tempfile.TemporaryDirectory(prefix=".torchdeform-", dir=_nearest_folder(folder))
+    except OSError as error:
+        raise InputError(f"cannot write to {folder}: {error.strerror}; choose another folder") from error
+
+
 def _nearest_folder(folder: Path) -> Path:
-    """Return the folder itself if it exists, else the nearest of its parents that does."""
+    """Return the folder itself if it exists, else its nearest parent that exists."""
     for candidate in (folder, *folder.absolute().parents):
         if candidate.is_dir():
             return candidate
         if candidate.exists() or candidate.is_symlink():
             raise InputError(f"cannot write to {folder}: {candidate} is not a folder; choose another name")
-    raise InputError(f"cannot write to {folder}: no such place; choose another folder")
-
-
-def require_writable(folder: Path) -> None:
-    """Raise `InputError` unless files can be written into ``folder``, which need not exist yet; leaves no trace."""
-    try:
-        with tempfile.TemporaryDirectory(prefix=".torchdeform-", dir=_nearest_folder(folder)):
-            pass
-    except OSError as error:
-        raise InputError(f"cannot write to {folder}: {error.strerror}; choose another folder") from error
+    raise InputError(f"cannot write to {folder}: there is no such place; choose another folder")
 
 
 @contextmanager
@@ -78,7 +79,7 @@ def native_stderr() -> Iterator[list[str]]:
     """Collect what C and C++ libraries print on stderr; the list is filled when the block ends.
 
     Notes:
-        Turns the process's file descriptor 2, so blocks in different threads wait for one another.
+        It redirects file descriptor 2 of the whole process, so only one thread at a time can be in such a block.
     """
     lines: list[str] = []
     with _STDERR, tempfile.TemporaryFile() as sink:

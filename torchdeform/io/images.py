@@ -1,4 +1,4 @@
-"""Reading and writing images, their place in the world kept exactly."""
+"""Reading and writing images with their exact position in the world."""
 
 import gzip
 import os
@@ -16,9 +16,9 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import dicom, itk
-from torchdeform.io.files import staged, suffix
+from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.io.tiff import read_tiff, write_tiff
-from torchdeform.io.validation import BROKEN_OFF, NOT_SQUARE, other_kind, require_sound
+from torchdeform.io.validation import DAMAGED, NOT_SQUARE, other_kind, require_sound
 
 
 @dataclass(frozen=True)
@@ -48,36 +48,35 @@ FORMATS: dict[str, Format] = {
     ".nhdr": _VOLUME,
 }
 
-# Pictures that ITK may refuse (grey with alpha, say) and scikit-image reads; ITK gives pictures like these spacing 1.
+# Pictures that ITK may refuse (for instance grey with alpha) but scikit-image reads. They have spacing 1 in ITK too.
 _PLAIN_PICTURES = (".png", ".gif", ".webp")
 
+# What the readers of ITK say about a file that is cut off, each in its own words.
+_DAMAGE_SIGNS = ("fread got only", "inflate", "Cannot read requested file", "unexpected end")
 
-# What ITK's readers say, each in its own words, of a file that breaks off.
-_SHORT = ("fread got only", "inflate", "Cannot read requested file", "unexpected end")
-
-# Types of volumes that TIFF holds with the distance of its pages.
+# Pixel types of volumes for which a TIFF can store the distance of its pages.
 _PAGED = ("uint8", "uint16", "float32")
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:
-    """Read a 2D or 3D image: DICOM, NIfTI, MetaImage, NRRD, PNG, JPEG, TIFF, BMP and what else ITK knows.
+    """Read a 2D or 3D image: DICOM, NIfTI, MetaImage, NRRD, PNG, JPEG, TIFF, BMP and other formats of ITK.
 
     Args:
-        path: the file, plain or packed with gzip; a folder with one DICOM series; or one of the files of a series.
+        path: the file, plain or compressed with gzip; a folder with one DICOM series; or one file of a series.
 
     Returns:
-        The image: float32 pixels, one channel or several, with origin, spacing and direction (LPS mm) of the file.
+        The image: float32 pixels, one or several channels, with origin, spacing and direction (LPS mm) of the file.
 
     Raises:
-        InputError: the file is missing, empty, damaged, of a format unknown, several volumes, or complex; a header
-            that makes no sense or axes that are not at right angles; a folder without DICOM files or with several
-            series; slices that are missing or doubled; or a NIfTI file with NaN or infinite voxels, which ITK would
-            read as 0.
+        InputError: the file is missing, empty, damaged, of an unknown format, has several volumes or complex numbers;
+            a header that makes no sense; axes that are not at right angles; a folder without DICOM files or with
+            several series; slices that are missing or double; or a NIfTI file with NaN or infinite voxels, which ITK
+            would read as 0.
 
     Notes:
-        An axis of a single sample is dropped, so a volume of one slice is a 2D image. It keeps its place when it
-        lies square to the world axis that is dropped; an oblique slice is taken in its own plane.
-        One DICOM file is its whole series where that is a volume of 8 slices or more, see `dicom.read_file`.
+        An axis with one sample is dropped, so a volume of one slice is a 2D image. It keeps its position if it is at a
+        right angle to the dropped world axis; an oblique slice gets the coordinates of its own plane.
+        One DICOM file is read as its whole series if that is a volume of 8 slices or more, see `dicom.read_file`.
         The pages of a TIFF are a volume.
     """
     file = Path(path)
@@ -88,19 +87,24 @@ def read_image(path: str | os.PathLike[str]) -> Image:
         return dicom.read_file(file)
     ending = suffix(file)
     if ending.endswith(".gz") and ending not in FORMATS:
-        return _read_packed(file)
+        return _read_gzip(file)
     return read_tiff(file) if ending in (".tif", ".tiff") and not other_kind(file) else _read_by_itk(file)
 
 
-def _read_packed(path: Path) -> Image:
-    """Read a file that gzip packed, in a folder that is gone afterwards."""
+def read_optional(path: Path | None) -> Image | None:
+    """Return the image of a file that may be left out."""
+    return None if path is None else read_image(path)
+
+
+def _read_gzip(path: Path) -> Image:
+    """Decompress a file into a temporary folder and read it there."""
     with tempfile.TemporaryDirectory() as folder:
         unpacked = Path(folder) / path.with_suffix("").name
         try:
             with gzip.open(path) as source, unpacked.open("wb") as target:
                 shutil.copyfileobj(source, target)
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-            raise InputError(f"{path} {BROKEN_OFF}") from error
+            raise InputError(f"{path} {DAMAGED}") from error
         try:
             return replace(read_image(unpacked), name=str(path))
         except InputError as error:
@@ -115,7 +119,7 @@ def _read_by_itk(path: Path) -> Image:
 
 
 def _read_otherwise(path: Path, reason: str) -> Image:
-    """Read a picture that ITK refuses with scikit-image, or say why the file cannot be read."""
+    """Read with scikit-image a picture that ITK refuses, or say why the file cannot be read."""
     if kind := other_kind(path):
         raise InputError(f"{path} holds a {kind} file under another name; rename it so that it ends in {kind}")
     if suffix(path) in _PLAIN_PICTURES:
@@ -128,17 +132,17 @@ def _read_otherwise(path: Path, reason: str) -> Image:
         return _picture(pixels[0] if len(pixels) == 1 else pixels, str(path))
     if "orthonormal" in reason:
         raise InputError(f"{path} {NOT_SQUARE}")
-    if any(sign in reason for sign in _SHORT):
-        raise InputError(f"{path} {BROKEN_OFF}")
+    if any(sign in reason for sign in _DAMAGE_SIGNS):
+        raise InputError(f"{path} {DAMAGED}")
     if "allocate memory" in reason:
-        raise InputError(f"{path} says that it is larger than the memory here; if it is not, its header is damaged")
+        raise InputError(f"{path} is, by its header, larger than the memory here; if it is not, the header is damaged")
     if "determine ImageIO" in reason:
         raise InputError(f"{path} is no image of a known format; convert it to PNG, TIFF, NIfTI, MetaImage or NRRD")
     raise InputError(f"{path} cannot be read ({reason}); export it again, or as another format")
 
 
 def _picture(values: NDArray[np.generic], name: str) -> Image:
-    """Return pixels (y, x) or (y, x, channels) as an image; grey with alpha becomes RGBA."""
+    """Return pixels (y, x) or (y, x, channels) as an image. Grey with alpha becomes RGBA."""
     pixels = values.reshape(*values.shape, 1) if values.ndim == 2 else values
     if pixels.ndim != 3:
         raise InputError(f"{name} is a series of {len(values)} pictures; save one of them and give that")
@@ -149,22 +153,22 @@ def _picture(values: NDArray[np.generic], name: str) -> Image:
 
 
 def write_image(image: Image, path: str | os.PathLike[str]) -> None:
-    """Write an image where it lies in the world, in the format that the file's ending tells.
+    """Write an image with its position in the world, in the format of the file's ending.
 
     Args:
-        image: 2D or 3D; its ``pixel_type`` is kept in picture formats that can hold it (rounded and clamped for
-            integers), volume formats (NIfTI, MetaImage, NRRD) get float32.
-        path: the file; an existing one is replaced, missing folders are made.
+        image: 2D or 3D. Picture formats that can hold its ``pixel_type`` keep it (rounded and clamped for integers);
+            volume formats (NIfTI, MetaImage, NRRD) get float32.
+        path: the file; an existing one is replaced, missing folders are created.
 
     Raises:
-        InputError: unknown ending, pixels that the format cannot hold, or a place that cannot be written.
+        InputError: unknown ending, pixels that the format cannot hold, or a folder that cannot be written.
 
     Notes:
-        The file appears whole or not at all.
+        The file appears complete or not at all.
     """
     file = Path(path)
     pixels, paged = _stored(image, file), suffix(file) in (".tif", ".tiff") and image.grid.dim == 3
-    with staged(file.parent) as folder:
+    with atomic_folder(file.parent) as folder:
         if paged and pixels.dtype.name in _PAGED:
             write_tiff(pixels, image.grid.spacing, folder / file.name)
         else:
@@ -172,7 +176,7 @@ def write_image(image: Image, path: str | os.PathLike[str]) -> None:
 
 
 def _stored(image: Image, path: Path) -> NDArray[np.generic]:
-    """Return the pixels ``(C, *S)`` in the type to store, `InputError` where the format cannot hold them."""
+    """Return the pixels ``(C, *S)`` in the type to store; `InputError` if the format cannot hold them."""
     ending = suffix(path)
     if ending not in FORMATS:
         raise InputError(f"{path} has no ending that can be written; use one of {', '.join(FORMATS)}")
@@ -197,32 +201,32 @@ def can_hold(ending: str, image: Image) -> bool:
 
 
 def ending_like(path: Path, image: Image) -> str:
-    """Return the ending that stores ``image`` like the file ``path``, ``.nii.gz`` where that cannot hold it."""
+    """Return the ending that stores ``image`` like the file ``path``, ``.nii.gz`` if that format cannot hold it."""
     ending = suffix(path)
     endings = (ending, ".png") if ending in _PLAIN_PICTURES else (ending,)
     return next((e for e in endings if can_hold(e, image)), ".nii.gz")
 
 
 def image_size(path: Path) -> tuple[tuple[int, ...], int] | None:
-    """Return the shape (z, y, x; axes of one sample dropped) and the channels of an image file, None if unknown.
+    """Return the shape (z, y, x; without axes of one sample) and the channels of an image file, None if unknown.
 
     Args:
-        path: a file, or a folder of DICOM slices, all of which are taken for one series.
+        path: a file, or a folder of DICOM slices, which are all counted as one series.
 
     Notes:
-        Reads no pixels, so a file may turn out damaged later. What ITK does not know is unknown here.
+        Reads no pixels, so the file may still be damaged. Formats that ITK does not know are unknown here.
     """
     import SimpleITK as sitk
 
     files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
     reader = sitk.ImageFileReader()
 
-    def look() -> tuple[tuple[int, ...], int]:
+    def read_header() -> tuple[tuple[int, ...], int]:
         reader.SetFileName(str(files[0]))
         reader.ReadImageInformation()
         return reader.GetSize(), reader.GetNumberOfComponents()
 
-    found = itk.quietly(look) if files else None
+    found = itk.quietly(read_header) if files else None
     if found is None or isinstance(found, RuntimeError):
         return None
     size, channels = found

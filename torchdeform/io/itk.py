@@ -1,4 +1,4 @@
-"""Between tensors (array order z, y, x) and SimpleITK's images (x, y, z, LPS mm): the one place that turns them."""
+"""Conversion between tensors (array order z, y, x) and SimpleITK's images (x, y, z, LPS mm); the only place for it."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,26 +14,26 @@ from torchdeform.core.grid import Grid, slabs
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io.files import native_stderr
-from torchdeform.io.validation import BROKEN_OFF, NOT_SQUARE
+from torchdeform.io.validation import DAMAGED, NOT_SQUARE
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
 
-# What the libraries below ITK print, rather than raise, when a file breaks off.
-_BROKEN_OFF = ("TIFFReadDirectory", "TIFFFetchDirectory", "TIFFFillStrip", "not read completely")
+# What the libraries below ITK print, instead of raising an error, when a file is cut off.
+_DAMAGE_SIGNS = ("TIFFReadDirectory", "TIFFFetchDirectory", "TIFFFillStrip", "not read completely")
 
-# The columns of a direction matrix may deviate from unit length and right angles by this much.
+# How much the columns of a direction matrix may deviate from unit length and right angles.
 _SQUARE = 1e-3
 
 _Result = TypeVar("_Result")
 
 
 def load(path: Path) -> "sitk.Image":
-    """Read a file with SimpleITK, its fourth axis dropped if it holds one volume only.
+    """Read a file with SimpleITK. A fourth axis is dropped if it holds only one volume.
 
     Raises:
-        InputError: the file breaks off, or holds a series.
-        RuntimeError: ITK cannot read it, in ITK's own words; the caller may know another way.
+        InputError: the file is cut off, or holds a series.
+        RuntimeError: ITK cannot read it, in ITK's own words; the caller may try another reader.
     """
     import SimpleITK as sitk
 
@@ -41,22 +41,22 @@ def load(path: Path) -> "sitk.Image":
     reader.SetFileName(str(path))
     with native_stderr() as printed, _no_warnings():
         image = _execute(reader)
-    if any(sign in line for line in printed for sign in _BROKEN_OFF):
-        raise InputError(f"{path} {BROKEN_OFF}")
+    if any(sign in line for line in printed for sign in _DAMAGE_SIGNS):
+        raise InputError(f"{path} {DAMAGED}")
     if isinstance(image, RuntimeError):
         raise image
     return image
 
 
 def values(path: Path) -> NDArray[np.generic]:
-    """Return the pixels of a file as SimpleITK has them, channels last; raises like `load`."""
+    """Return the pixels of a file as SimpleITK gives them, channels last; raises like `load`."""
     import SimpleITK as sitk
 
     return sitk.GetArrayFromImage(load(path))
 
 
 def _execute(reader: "sitk.ImageFileReader") -> "sitk.Image | RuntimeError":
-    """Read what the reader was set to, a series of one as its only volume; ITK's error is returned, not raised."""
+    """Read the reader's file, a series of one volume as that volume. ITK's error is returned, not raised."""
     try:
         reader.ReadImageInformation()
         size = reader.GetSize()
@@ -73,7 +73,7 @@ def _execute(reader: "sitk.ImageFileReader") -> "sitk.Image | RuntimeError":
 
 
 def quietly(work: Callable[[], _Result]) -> "_Result | RuntimeError":
-    """Return what ``work`` returns, or the error that it raises, with ITK's chatter kept off the terminal."""
+    """Return what ``work`` returns, or the error that it raises. What ITK prints meanwhile is dropped."""
     with native_stderr(), _no_warnings():
         try:
             return work()
@@ -82,24 +82,24 @@ def quietly(work: Callable[[], _Result]) -> "_Result | RuntimeError":
 
 
 def save(image: "sitk.Image", path: Path) -> None:
-    """Write a file with SimpleITK, compressed where the format knows how, `InputError` if it cannot be written."""
+    """Write a file with SimpleITK, compressed if the format can; `InputError` if it cannot be written."""
     import SimpleITK as sitk
 
     try:
         with native_stderr(), _no_warnings():
             sitk.WriteImage(image, str(path), useCompression=True)
     except RuntimeError as error:
-        raise InputError(f"{path.name} cannot be written: {reason(error)}; choose another format or place") from error
+        raise InputError(f"{path.name} cannot be written: {reason(error)}; choose another format or folder") from error
 
 
 def reason(error: RuntimeError) -> str:
-    """Return what ITK says in the last line of its message, without the addresses."""
+    """Return the last line of an error message of ITK, without memory addresses."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1].rpartition("): ")[2].removeprefix("sitk::ERROR: ").rstrip(". ")
 
 
 class _no_warnings:
-    """Keep ITK's own warnings off while the block runs."""
+    """Switch the warnings of ITK off inside the block."""
 
     def __enter__(self) -> None:
         import SimpleITK as sitk
@@ -114,11 +114,11 @@ class _no_warnings:
 
 
 def to_image(itk: "sitk.Image", name: str) -> Image:
-    """Return a SimpleITK image as an `Image` with float32 pixels; axes of a single sample are dropped.
+    """Return a SimpleITK image as an `Image` with float32 pixels, without axes of one sample.
 
     Notes:
-        A slice of a volume becomes a 2D image. It keeps its place when it lies square to the world axis that is
-        dropped; an oblique slice is taken in its own plane: x and y are then distances along its rows and columns.
+        A slice of a volume becomes a 2D image. It keeps its position if it is at a right angle to the dropped world
+        axis. An oblique slice gets the coordinates of its own plane: distances along its rows and columns.
     """
     import SimpleITK as sitk
 
@@ -138,7 +138,7 @@ def to_image(itk: "sitk.Image", name: str) -> Image:
 
 
 def _require_square(itk: "sitk.Image", name: str) -> None:
-    """Raise `InputError` unless the axes are at right angles: MetaImage and NRRD may hold anything."""
+    """Raise `InputError` unless the axes are at right angles: MetaImage and NRRD can hold any matrix."""
     axes = np.array(itk.GetDirection()).reshape(itk.GetDimension(), -1)
     if np.abs(axes.T @ axes - np.eye(len(axes))).max() > _SQUARE:
         raise InputError(f"{name} {NOT_SQUARE}")
@@ -157,7 +157,7 @@ def _drop_single_axes(itk: "sitk.Image") -> tuple[list[float], NDArray[np.float6
 
 
 def from_values(values: NDArray[np.generic], place: Image) -> "sitk.Image":
-    """Return an array ``(C, *S)`` at the place of an `Image` as a SimpleITK image, a vector image when C > 1."""
+    """Return an array ``(C, *S)`` at the position of an `Image` as a SimpleITK image, a vector image if C > 1."""
     import SimpleITK as sitk
 
     vector = values.shape[0] > 1
@@ -171,7 +171,7 @@ def from_values(values: NDArray[np.generic], place: Image) -> "sitk.Image":
 def to_world_vectors(u: Tensor, place: Image, kind: DTypeLike = np.float64) -> NDArray[np.floating]:
     """Return u ``(1, D, *S)`` (array order, units of spacing) as ITK's vectors ``(D, *S)``: direction · (x, y, z).
 
-    They are computed in float64 and lie in memory as ITK has them, one node's vector after another's.
+    They are computed in float64. Their memory layout is that of ITK: the components of one node are adjacent.
     """
     dim, shape = place.grid.dim, place.grid.shape
     found = np.empty((*shape, dim), dtype=kind)
@@ -182,7 +182,7 @@ def to_world_vectors(u: Tensor, place: Image, kind: DTypeLike = np.float64) -> N
 
 
 def to_grid_vectors(vectors: Tensor, place: Image) -> Tensor:
-    """Return ITK's vectors ``(1, D, *S)`` as u in array order and units of spacing, undoing `to_world_vectors`."""
+    """Return ITK's vectors ``(1, D, *S)`` as u in array order and units of spacing; inverse of `to_world_vectors`."""
     inverse = torch.from_numpy(np.linalg.inv(_matrix(place.direction)))
     return torch.einsum("ij,bj...->bi...", inverse, vectors.double()).flip(1).to(vectors.dtype)
 

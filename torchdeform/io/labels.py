@@ -1,4 +1,4 @@
-"""Label images on disk: every value as it is, in the type it is stored with."""
+"""Label images on disk: every value unchanged, in the type of the file."""
 
 import os
 from dataclasses import replace
@@ -10,23 +10,22 @@ import torch
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import itk
-from torchdeform.io.files import staged, suffix
+from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.io.images import FORMATS, read_image, write_image
 
-# Types with values that float32, in which images are read, does not tell apart.
+# Types whose values float32, in which images are read, cannot all represent.
 _WIDE = ("int32", "uint32", "int64", "uint64", "float64")
-_COLOURED = (3, 4)  # channels
 _VOLUMES = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd", ".nhdr")
 
 
 def read_labels(path: str | os.PathLike[str]) -> Image:
-    """Read a label image: like `read_image`, but volumes in float64 where float32 would merge labels above 2²⁴.
+    """Read a label image: like `read_image`, but volumes in float64 if float32 would merge labels above 2²⁴.
 
     Args:
         path: the file, any format that `read_image` reads.
 
     Returns:
-        The image; a picture whose three channels are equal, as drawing programs save grey ones, has one.
+        The image. A picture with three equal channels, as drawing programs save grey values, becomes one channel.
 
     Raises:
         InputError: as `read_image`.
@@ -43,14 +42,14 @@ def read_labels(path: str | os.PathLike[str]) -> Image:
 
 
 def write_labels(image: Image, path: str | os.PathLike[str]) -> None:
-    """Write a label image in its own ``pixel_type``, volumes too; whole or not at all.
+    """Write a label image in its own ``pixel_type``, volumes too; complete or not at all.
 
     Args:
-        image: whole numbers, with their place in the world.
+        image: whole numbers, with their position in the world.
         path: the file, any format that `write_image` writes.
 
     Raises:
-        InputError: a format that cannot hold that type, or a place that cannot be written.
+        InputError: a format that cannot hold that type, or a folder that cannot be written.
     """
     file, ending = Path(path), suffix(Path(path))
     if ending not in _VOLUMES:
@@ -58,13 +57,6 @@ def write_labels(image: Image, path: str | os.PathLike[str]) -> None:
             raise InputError(f"{path}: {ending} files cannot hold labels of type {image.pixel_type}; use .nii.gz")
         return write_image(image, file)
     values = image.data[0].detach().cpu().numpy().astype(image.pixel_type)
-    with staged(file.parent) as folder:
+    with atomic_folder(file.parent) as folder:
         itk.save(itk.from_values(values, image), folder / file.name)
     return None
-
-
-def _grey(image: Image) -> Image:
-    """Return the one channel that red, green and blue have in common, or the image as it is."""
-    colours = image.data[:, :3]
-    same = image.data.shape[1] in _COLOURED and bool((colours == colours[:, :1]).all())
-    return replace(image, data=image.data[:, :1]) if same else image

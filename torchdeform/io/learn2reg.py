@@ -1,4 +1,4 @@
-"""Displacement fields as the Learn2Reg challenge reads them: in voxels, for NumPy's arrays of NIfTI files."""
+"""Displacement fields as the Learn2Reg challenge reads them: in voxels, for the NumPy arrays of NIfTI files."""
 
 from pathlib import Path
 
@@ -8,16 +8,16 @@ from torch import Tensor
 
 from torchdeform.core.image import Image
 from torchdeform.io import itk
-from torchdeform.io.files import staged
+from torchdeform.io.files import atomic_folder
 
 
 def voxel_displacement(u: Tensor, fixed: Image, moving: Image) -> Tensor:
-    """Return d with ``index of moving = index of fixed + d`` for φ = id + u, both images in their physical place.
+    """Return d with ``index of moving = index of fixed + d`` for φ = id + u, both images at their world position.
 
     Args:
         u: displacement ``(1, D, *S)`` on the fixed grid, array order, units of spacing.
-        fixed: the image whose grid it lives on.
-        moving: the image that it leads to.
+        fixed: the image whose grid u is given on.
+        moving: the image that φ maps to.
 
     Returns:
         ``(1, D, *S)`` in voxels, component k along array axis k, float64.
@@ -33,16 +33,16 @@ def write_voxel_displacement(u: Tensor, fixed: Image, moving: Image, path: Path)
 
     Args:
         u: displacement ``(1, D, *S)`` on the fixed grid, array order, units of spacing.
-        fixed: the image whose grid it lives on.
-        moving: the image that it leads to.
-        path: the file, ``.nii.gz``; replaced whole.
+        fixed: the image whose grid u is given on.
+        moving: the image that φ maps to.
+        path: the file, ``.nii.gz``; an existing one is replaced.
 
     Raises:
-        InputError: a place that cannot be written.
+        InputError: a folder that cannot be written.
 
     Notes:
         The evaluation computes ``map_coordinates(moving, identity + displacement)`` on arrays as nibabel returns them,
-        whose axes are x, y, z; it reads no header. float32, the smallest floating type that NIfTI has.
+        whose axes are x, y, z. It reads no header. The type is float32, the smallest floating type of NIfTI.
     """
     import SimpleITK as sitk
 
@@ -54,5 +54,5 @@ def write_voxel_displacement(u: Tensor, fixed: Image, moving: Image, path: Path)
     image.SetSpacing((*fixed.grid.spacing[::-1], 1.0))
     image.SetOrigin((*fixed.origin, 0.0))
     image.SetDirection(direction.flatten().tolist())
-    with staged(path.parent) as folder:
+    with atomic_folder(path.parent) as folder:
         itk.save(image, folder / path.name)

@@ -1,4 +1,4 @@
-"""Landmarks on disk: csv and tsv, elastix txt, 3D Slicer's fcsv and mrk.json; in memory always world points, LPS mm."""
+"""Landmarks on disk: csv, tsv, elastix txt, 3D Slicer's fcsv and mrk.json. In memory they are world points, LPS mm."""
 
 import csv
 import json
@@ -14,27 +14,27 @@ from torch import Tensor
 
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.io.files import staged, suffix
+from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.io.validation import require_sound
 
 _WORLD, _VOXEL = ("x", "y", "z"), ("i", "j", "k")
 _NAMES = ("name", "label", "landmark", "id", "index", "")
 
-# What Slicer has written for its coordinate systems, by version; RAS is what it meant when it wrote nothing.
+# How versions of Slicer write their coordinate systems. RAS is meant where nothing is written.
 _SYSTEMS = {"lps": "lps", "1": "lps", "ras": "ras", "0": "ras", "": "ras"}
-_FCSV_COLUMNS = ["label", "x", "y", "z", "sel", "vis"]  # of the versions that name none
+_FCSV_COLUMNS = ["label", "x", "y", "z", "sel", "vis"]  # of versions that name no columns
 
 _Path = str | os.PathLike[str]
 
 
 @dataclass(frozen=True)
 class Points:
-    """Named points of the world.
+    """Points in the world with names.
 
     Args:
         positions: ``(N, D)``, (x, y, z) in LPS mm, float64.
         names: one for each point.
-        named: False where a file names nothing, or not every point differently: the names are then 1, 2, 3, ...
+        named: False if a file has no names, or the same name twice. The names are then 1, 2, 3, ...
     """
 
     positions: Tensor
@@ -44,32 +44,32 @@ class Points:
 
 @dataclass(frozen=True)
 class _Table:
-    """What a file holds: names (empty where there are none) and rows of numbers, world LPS mm or voxel indices."""
+    """The content of a file: names (empty if there are none) and rows of numbers, world LPS mm or voxel indices."""
 
     names: list[str]
     rows: list[list[float]]
     voxels: bool = False
-    flat: bool = False  # a third column of zeros only fills up
+    flat: bool = False  # a third column of zeros means 2D points
 
 
 def read_points(path: _Path, image: Image | None = None, *, dim: int | None = None) -> Points:
     """Read landmarks.
 
     Args:
-        path: ``.csv`` or ``.tsv`` with columns x, y[, z] (world LPS mm, so pixels of a picture, whose spacing is 1) or
-            i, j[, k] (voxel index of ``image`` along its x, y, z axes, from 0), in capitals or not, and perhaps a name
-            column (name, label, landmark, id, index, or no title), or 2 or 3 numbers a line without titles, or ANTs'
-            x, y, z, t; ``.txt`` of elastix (``point`` or ``index``, count, rows); ``.fcsv`` and ``.mrk.json`` of 3D
-            Slicer, RAS or LPS as their headers say.
-        image: the image that voxel indices count in; it also says whether points are 2D or 3D.
-        dim: 2 or 3; else that of the image, else what the file holds.
+        path: ``.csv`` or ``.tsv`` with columns x, y[, z] (world LPS mm, which are pixels for a picture with spacing 1)
+            or i, j[, k] (voxel index of ``image`` along its x, y, z axes, from 0), in upper or lower case, with or
+            without a column of names (name, label, landmark, id, index, or no title); or 2 or 3 numbers per line
+            without titles; or ANTs' x, y, z, t. ``.txt`` of elastix (``point`` or ``index``, count, rows). ``.fcsv``
+            and ``.mrk.json`` of 3D Slicer, in RAS or LPS as the header says.
+        image: the image that voxel indices refer to; it also says whether points are 2D or 3D.
+        dim: 2 or 3; by default that of the image, without an image that of the file.
 
     Returns:
-        The points in the world. A third coordinate that is 0 throughout is dropped where 2D points are wanted.
+        The points in the world. If 2D points are needed, a third coordinate that is always 0 is dropped.
 
     Raises:
-        InputError: the file is missing, of another kind, has no points, something that is no finite number, indices
-            without an image, or points of another dimension.
+        InputError: the file is missing, of another kind, without points, with values that are no finite numbers, with
+            indices but without an image, or with points of another dimension.
     """
     file = Path(path)
     require_sound(file)
@@ -86,10 +86,10 @@ def read_points(path: _Path, image: Image | None = None, *, dim: int | None = No
 
 
 def matched(fixed: Points, moving: Points) -> tuple[Tensor, Tensor, tuple[str, ...]]:
-    """Return the points that two files share, row by row the same landmark: by name, or by order where names miss.
+    """Return the points that two files share, matched by name, or by order if a file has no names.
 
     Returns:
-        Positions ``(N, D)`` of each, and the names.
+        Positions ``(N, D)`` in both images, and the names. A row is the same landmark in both.
 
     Raises:
         InputError: no name in common, or no names and different counts.
@@ -107,24 +107,24 @@ def matched(fixed: Points, moving: Points) -> tuple[Tensor, Tensor, tuple[str, .
 
 
 def write_points(points: Points, path: _Path) -> None:
-    """Write landmarks, world LPS mm, in the format that the file's ending tells; see `read_points`.
+    """Write landmarks, world LPS mm, in the format of the file's ending; see `read_points`.
 
     Args:
         points: names and positions.
-        path: the file; replaced whole.
+        path: the file; an existing one is replaced.
 
     Raises:
-        InputError: an unknown ending, or a place that cannot be written.
+        InputError: an unknown ending, or a folder that cannot be written.
     """
     file = Path(path)
     require_points_file(file)
     text = _WRITERS[suffix(file)](points)
-    with staged(file.parent) as folder:
+    with atomic_folder(file.parent) as folder:
         (folder / file.name).write_text(text, encoding="utf-8")
 
 
 def require_points_file(path: Path) -> None:
-    """Raise `InputError` unless points can be written in files of this ending."""
+    """Raise `InputError` unless points can be written to files of this ending."""
     if suffix(path) not in _WRITERS:
         raise InputError(f"{path} has no ending that points are written with; use one of {', '.join(_WRITERS)}")
 
@@ -133,12 +133,10 @@ def _place(table: _Table, name: str, image: Image | None, dim: int | None) -> Po
     """Return the points of a table in the world."""
     wide = len(table.rows[0])
     zeros = wide == 3 and all(row[2] == 0 for row in table.rows)
-    want = dim or (2 if zeros and table.flat else wide)
-    if want != wide and not (want == 2 and zeros):
-        raise InputError(
-            f"{name} holds points of {wide}D, but {want}D is needed here; give points of the same dimension"
-        )
-    positions = torch.tensor([row[:want] for row in table.rows], dtype=torch.float64)
+    needed = dim or (2 if zeros and table.flat else wide)
+    if needed != wide and not (needed == 2 and zeros):
+        raise InputError(f"{name} holds {wide}D points, but {needed}D is needed here; give points of that dimension")
+    positions = torch.tensor([row[:needed] for row in table.rows], dtype=torch.float64)
     if table.voxels:
         positions = _from_voxels(positions, name, image)
     named = all(table.names) and len(set(table.names)) == len(table.rows)
@@ -147,9 +145,11 @@ def _place(table: _Table, name: str, image: Image | None, dim: int | None) -> Po
 
 def _from_voxels(index: Tensor, name: str, image: Image | None) -> Tensor:
     if image is None:
-        raise InputError(f"{name} counts in voxels; give the image they belong to, or points in world mm (x, y, z)")
+        raise InputError(
+            f"{name} counts in voxels; give the image that the points belong to, or points in world mm (x, y, z)"
+        )
     if image.grid.dim != index.shape[1]:
-        raise InputError(f"{name} holds points of {index.shape[1]}D, but {image.name} is {image.grid.dim}D")
+        raise InputError(f"{name} holds {index.shape[1]}D points, but {image.name} is {image.grid.dim}D; give others")
     spacing = torch.tensor(image.grid.spacing, dtype=torch.float64)
     return image.to_world((index.flip(1) * spacing).T.unsqueeze(0))[0].T
 
@@ -159,7 +159,7 @@ def _numbers(count: int) -> tuple[str, ...]:
 
 
 def _floats(cells: Sequence[object], name: str) -> list[float]:
-    """Return cells as finite numbers."""
+    """Return cells as finite numbers, `InputError` if one is none."""
     try:
         values = [float(cell) for cell in cells]  # type: ignore[arg-type]
     except (TypeError, ValueError):
@@ -188,12 +188,12 @@ def _from_rows(rows: list[list[str]], name: str) -> _Table:
             break
     plain = [row for row in rows if not row[0].lstrip().startswith("#")]
     if plain and (len(plain[0]) not in (2, 3) or any(c.isalpha() for c in "".join(plain[0]))):
-        raise InputError(f"{name} has no columns x, y[, z] (world LPS mm) or i, j[, k] (voxels); title them")
+        raise InputError(f"{name} has no columns x, y[, z] (world LPS mm) or i, j[, k] (voxels); add titles")
     return _Table([""] * len(plain), [_floats(_same_length(row, len(plain[0]), name), name) for row in plain])
 
 
 def _axes(titles: list[str]) -> list[str]:
-    """Return the titles of the coordinates, two or three, or none."""
+    """Return the two or three titles of the coordinates, an empty list without them."""
     for axes in (_WORLD, _VOXEL):
         if set(axes[:2]) <= set(titles):
             return [axis for axis in axes if axis in titles]
@@ -222,7 +222,9 @@ def _read_elastix(text: str, name: str) -> _Table:
         raise InputError(f"{name} is no elastix file of points: line 1 must be point or index, line 2 the count")
     rows = [_floats(line.split(), name) for line in body.splitlines() if line.strip()]
     if len(rows) != int(count) or {len(row) for row in rows} not in ({2}, {3}, set()):
-        raise InputError(f"{name} announces {count.strip()} points of 2 or 3 numbers, but that is not what follows")
+        raise InputError(
+            f"{name} announces {count.strip()} points of 2 or 3 numbers, but other rows follow; correct the count"
+        )
     return _Table([""] * len(rows), rows, voxels=kind.strip().lower() == "index")
 
 
@@ -276,7 +278,7 @@ def _read_markups(text: str, name: str) -> _Table:
 def _require_mm(markup: dict[str, Any], name: str) -> None:
     units = markup.get("coordinateUnits", "mm")
     if units not in ("mm", ["mm", "UCUM", "length"]):
-        raise InputError(f"{name} counts in {units}; save the points in mm")
+        raise InputError(f"{name} has its points in {units}; save them in mm")
 
 
 _READERS: dict[str, Callable[[str, str], _Table]] = {
@@ -334,7 +336,7 @@ def _write_markups(points: Points) -> str:
 
 
 def _in_space(points: Points) -> list[list[float]]:
-    """Return rows of three coordinates: Slicer knows no others."""
+    """Return rows of three coordinates, the only ones that Slicer knows."""
     return [[*row, 0.0][:3] for row in points.positions.tolist()]
 
 

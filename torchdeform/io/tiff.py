@@ -1,4 +1,4 @@
-"""TIFF: pages that are a volume, channels, colour tables, and spacing from whichever tags a microscope left."""
+"""TIFF: pages as a volume, channels, colour tables, and the spacing from the tags that microscopes write."""
 
 import logging
 import math
@@ -17,50 +17,50 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import itk
-from torchdeform.io.validation import BROKEN_OFF
+from torchdeform.io.validation import DAMAGED
 
 if TYPE_CHECKING:
     from tifffile import TiffFile
 
-# Millimetres of a unit, by the names that ImageJ and OME write.
+# Length of a unit in millimetres, by the names that ImageJ and OME write.
 _MILLIMETRES = {
     "nm": 1e-6, "nanometer": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "\\u00b5m": 1e-3, "micron": 1e-3,
     "microns": 1e-3, "micrometer": 1e-3, "mm": 1.0, "millimeter": 1.0, "cm": 10.0, "centimeter": 10.0, "m": 1e3,
     "inch": 25.4, "in": 25.4,
 }  # fmt: skip
-_RESOLUTION_UNITS = {2: 25.4, 3: 10.0}  # of the resolution tag: inch, centimetre
-_DEPTH, _CHANNELS = "ZQI", "CS"  # tifffile's letters for axes: depth or unnamed pages; channels or samples
-_BROKEN = ("invalid offset", "invalid value offset", "invalid page offset", "corrupted")
+_RESOLUTION_UNITS = {2: 25.4, 3: 10.0}  # of the resolution tag: inch and centimetre in mm
+_DEPTH, _CHANNELS = "ZQI", "CS"  # letters of tifffile for axes: depth or unnamed pages; channels or samples
+_DAMAGE_SIGNS = ("invalid offset", "invalid value offset", "invalid page offset", "corrupted")
 _ERRORS = (OSError, ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError, struct.error)
 
 
 def read_tiff(path: Path) -> Image:
-    """Read a TIFF: one page as a 2D image, pages as a volume; spacing in mm from its tags, 1 where there are none.
+    """Read a TIFF: one page as a 2D image, pages as a volume. Spacing in mm from its tags, 1 without such tags.
 
     Args:
         path: the file.
 
     Raises:
-        InputError: damaged, pages of different sizes, several moments, or complex numbers.
+        InputError: damaged, pages of different sizes, several time points, or complex numbers.
 
     Notes:
-        Understands what ImageJ, OME and the resolution tags say of spacing, and colour tables.
+        Understands the spacing of ImageJ, of OME and of the resolution tags, and colour tables.
     """
     import tifffile
 
     try:
-        with _complaints() as complaints, tifffile.TiffFile(path) as file:
+        with _log_messages() as messages, tifffile.TiffFile(path) as file:
             axes, shape = _require_one(file, path)
             values, spacing = _values(file, path, shape), _spacing(file)
             table = file.series[0].keyframe.colormap
     except InputError:
         raise
     except _ERRORS as error:
-        raise InputError(f"{path} {BROKEN_OFF}") from error
-    if any(sign in line for line in complaints for sign in _BROKEN):
-        raise InputError(f"{path} {BROKEN_OFF}")
+        raise InputError(f"{path} {DAMAGED}") from error
+    if any(sign in line for line in messages for sign in _DAMAGE_SIGNS):
+        raise InputError(f"{path} {DAMAGED}")
     if table is not None and values.dtype.kind == "u" and values.max() < table.shape[1]:
-        colours = np.take(table // 256, values.astype(np.intp), axis=1)  # tables have 16 bits, pictures made of them 8
+        colours = np.take(table // 256, values.astype(np.intp), axis=1)  # a table has 16 bits, the picture 8
         axes, values = axes + "S", np.moveaxis(colours, 0, -1).astype(np.uint8)
     if np.iscomplexobj(values):
         raise InputError(f"{path} holds complex numbers; save their magnitude and give that")
@@ -68,8 +68,8 @@ def read_tiff(path: Path) -> Image:
 
 
 @contextmanager
-def _complaints() -> Iterator[list[str]]:
-    """Collect what tifffile logs, and keep it off the terminal."""
+def _log_messages() -> Iterator[list[str]]:
+    """Collect what tifffile logs, so that it is not printed."""
     lines: list[str] = []
     handler = logging.Handler()
     handler.emit = lambda record: lines.append(record.getMessage())
@@ -84,42 +84,42 @@ def _complaints() -> Iterator[list[str]]:
 
 
 def _require_one(file: "TiffFile", path: Path) -> tuple[str, tuple[int, ...]]:
-    """Return the letters and lengths of the axes, `InputError` unless the file is one image or volume."""
+    """Return the letters and lengths of the axes; `InputError` unless the file is one image or volume."""
     first, *others = file.series
     if any(s.shape != first.shape for s in others):
         sizes = ", ".join("×".join(map(str, s.shape)) for s in file.series[:3])
-        raise InputError(f"{path} has pages of different sizes ({sizes}); save the page wanted and give that")
+        raise InputError(f"{path} has pages of different sizes ({sizes}); save the page that you want and give that")
     several = {axis: n for axis, n in zip(first.axes, first.shape, strict=True) if n > 1}
     if others and not set(several) & set(_DEPTH):  # pages written one by one
         return _DEPTH[0] + first.axes, (1 + len(others), *first.shape)
-    strange = [n for axis, n in several.items() if axis not in "YX" + _DEPTH + _CHANNELS]
-    if strange or others:
-        count = math.prod(strange) * len(file.series)
-        raise InputError(f"{path} is a series of {count} images or moments; save one of them and give that")
+    other = [n for axis, n in several.items() if axis not in "YX" + _DEPTH + _CHANNELS]
+    if other or others:
+        count = math.prod(other) * len(file.series)
+        raise InputError(f"{path} is a series of {count} images or time points; save one of them and give that")
     return first.axes, first.shape
 
 
 def _values(file: "TiffFile", path: Path, shape: tuple[int, ...]) -> NDArray[np.generic]:
-    """Return the pixels, by way of ITK where they are compressed in a way (LZW, JPEG) that it alone knows here."""
+    """Return the pixels. ITK reads compressions (LZW, JPEG) that tifffile does not know without further packages."""
     try:
         return np.stack([series.asarray() for series in file.series]).reshape(shape)
     except ValueError as error:
         if "imagecodecs" not in str(error):
             raise
     values = itk.values(path)
-    if values.size != math.prod(shape):  # ITK adds alpha to JPEG's colours
+    if values.size != math.prod(shape):  # ITK adds alpha to the colours of JPEG
         values = values[..., :3]
     return values.reshape(shape)
 
 
 def _spacing(file: "TiffFile") -> tuple[float, float, float]:
-    """Return the distances of pages, rows and columns in mm, 1 where nothing is said."""
+    """Return the distances of pages, rows and columns in mm, 1 without tags."""
     ome, imagej, page = file.ome_metadata, file.imagej_metadata, file.series[0].keyframe
     if ome and (found := _ome_spacing(ome)):
         return found
-    said = "XResolution" in page.tags and page.resolution != (1, 1)
+    tagged = "XResolution" in page.tags and page.resolution != (1, 1)
     down, across = (1 / r if 0 < r < math.inf else 1.0 for r in reversed(page.resolution))
-    depth, unit = 1.0, _RESOLUTION_UNITS.get(int(page.resolutionunit)) if said else None
+    depth, unit = 1.0, _RESOLUTION_UNITS.get(int(page.resolutionunit)) if tagged else None
     if imagej and imagej.get("unit"):
         unit = _MILLIMETRES.get(str(imagej["unit"]).lower(), 1.0)
         depth = float(imagej.get("spacing", 1.0)) * unit
@@ -127,7 +127,7 @@ def _spacing(file: "TiffFile") -> tuple[float, float, float]:
 
 
 def _ome_spacing(text: str) -> tuple[float, float, float] | None:
-    """Return PhysicalSizeZ, Y, X in mm, None where the description has no sizes or cannot be read."""
+    """Return PhysicalSizeZ, Y, X in mm, None if the description has no sizes or cannot be read."""
     try:
         pixels = ElementTree.fromstring(text).find(".//{*}Pixels")
     except ElementTree.ParseError:
@@ -141,7 +141,7 @@ def _ome_spacing(text: str) -> tuple[float, float, float] | None:
 
 
 def _image(axes: str, values: NDArray[np.generic], spacing: tuple[float, float, float], name: str) -> Image:
-    """Bring pixels with lettered axes into channels, depth, rows, columns."""
+    """Return pixels whose axes have letters as an image: channels, depth, rows, columns."""
     order = sorted(range(len(axes)), key=lambda k: (axes[k] not in _CHANNELS, axes[k] in "YX", axes[k] == "X"))
     ordered = np.transpose(values, order)
     channels = math.prod(n for n, axis in zip(values.shape, axes, strict=True) if axis in _CHANNELS)
@@ -158,7 +158,7 @@ def _image(axes: str, values: NDArray[np.generic], spacing: tuple[float, float, 
 
 
 def write_tiff(values: NDArray[np.generic], spacing: Sequence[float], path: Path) -> None:
-    """Write a volume as the pages of a TIFF that ImageJ understands, the distance of pages in its description.
+    """Write a volume as the pages of a TIFF for ImageJ, with the distance of the pages in its description.
 
     Args:
         values: ``(C, Z, Y, X)`` of a type that ImageJ has: uint8, uint16 or float32.

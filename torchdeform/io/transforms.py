@@ -1,4 +1,4 @@
-"""Displacement fields and transforms on disk as ITK reads them: LPS millimetres, x, y, z, points fixed -> moving."""
+"""Displacement fields and transforms on disk, as ITK reads them: LPS mm in x, y, z order, points fixed -> moving."""
 
 import os
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Stage, Transform
 from torchdeform.errors import InputError
 from torchdeform.io import itk
-from torchdeform.io.files import native_stderr, staged, suffix
+from torchdeform.io.files import atomic_folder, native_stderr, suffix
 from torchdeform.io.validation import require_sound
 
 if TYPE_CHECKING:
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 _Path = str | os.PathLike[str]
 
-# Endings by what the files hold.
+# Endings of files, by their content.
 COMPOSITES = (".h5", ".hdf5")
 AFFINES = (".tfm", ".txt", ".mat")
 FIELDS = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd")
 
-# A linear map is read off at steps this long, so that offsets of metres cost its matrix no digits.
+# A linear map is evaluated at points this far (mm) from the origin, so that large offsets cost its matrix no digits.
 _STEP = 1024.0
 
 
@@ -37,20 +37,20 @@ def write_displacement(u: Tensor, fixed: Image, path: _Path) -> None:
 
     Args:
         u: displacement ``(1, D, *S)`` on the fixed grid, array order, units of spacing.
-        fixed: the image whose grid it lives on.
-        path: the file, ``.nii.gz``, ``.mha`` or ``.nrrd``; replaced whole.
+        fixed: the image whose grid u is given on.
+        path: the file, ``.nii.gz``, ``.mha`` or ``.nrrd``; an existing one is replaced.
 
     Raises:
-        InputError: shape, more than one item, or a place that cannot be written.
+        InputError: shape, more than one item, or a folder that cannot be written.
 
     Notes:
-        Adding the vector to the world position of a voxel of the fixed image gives the world position in the moving
-        image whose value belongs there, as in ITK and ANTs. float32.
+        The world position of a voxel of the fixed image plus its vector is the world position in the moving image
+        whose value belongs to that voxel, as in ITK and ANTs. Stored as float32.
     """
     file = Path(path)
     _check_field(u, fixed, "write_displacement: u")
     field = itk.to_world_vectors(u, fixed, np.float32)
-    with staged(file.parent) as folder:
+    with atomic_folder(file.parent) as folder:
         itk.save(itk.from_values(field, fixed), folder / file.name)
 
 
@@ -58,7 +58,7 @@ def read_displacement(path: _Path) -> Image:
     """Read an ITK displacement field; the inverse of `write_displacement`.
 
     Returns:
-        An image whose ``data`` is u ``(1, D, *S)`` in array order and units of spacing, in the place of its grid.
+        An image whose ``data`` is u ``(1, D, *S)`` in array order and units of spacing, with its grid and position.
 
     Raises:
         InputError: the file is missing, damaged, or not a field of D components.
@@ -76,21 +76,21 @@ def write_transform(transform: Transform, path: _Path, /) -> None: ...
 @overload
 def write_transform(transform: Tensor, fixed: Image, path: _Path, /) -> None: ...
 def write_transform(transform: Transform | Tensor, *where: Any) -> None:
-    """Write a transform as ITK has it, in the form that the file's ending tells; points go from fixed to moving.
+    """Write a transform for ITK, in the form of the file's ending; points go from fixed to moving.
 
     Args:
-        transform: the chain; or a displacement u ``(1, D, *S)`` (array order, units of spacing), followed by the fixed
-            image whose grid it lives on, for φ = id + u.
-        where: the file, replaced whole: ``.h5`` keeps every stage (ITK composite, float64); ``.tfm``, ``.txt`` and
-            ``.mat`` hold affine maps only, joined into one; ``.nii.gz``, ``.mha`` and ``.nrrd`` hold the whole chain as
-            one displacement field on its `reference` (float32).
+        transform: the chain; or a displacement u ``(1, D, *S)`` (array order, units of spacing) of φ = id + u, followed
+            by the fixed image whose grid it is given on.
+        where: the file; an existing one is replaced. ``.h5`` keeps every stage (ITK composite, float64). ``.tfm``,
+            ``.txt`` and ``.mat`` hold affine maps only, joined into one. ``.nii.gz``, ``.mha`` and ``.nrrd`` hold the
+            whole chain as one displacement field on its `reference` (float32).
 
     Raises:
-        InputError: shape, an ending that cannot hold the transform, or a place that cannot be written.
+        InputError: shape, an ending that cannot hold the transform, or a folder that cannot be written.
 
     Notes:
-        `SimpleITK.ReadTransform`, ANTs and 3D Slicer read it. It takes points of the fixed space to the moving
-        space, which is what a resampler needs to bring the moving image onto the fixed one.
+        `SimpleITK.ReadTransform`, ANTs and 3D Slicer read the file. It maps points of the fixed space to the moving
+        space, as a resampler needs it to warp the moving image onto the fixed one.
     """
     *fixed, path = where
     if isinstance(transform, Tensor):
@@ -108,7 +108,7 @@ def write_transform(transform: Transform | Tensor, *where: Any) -> None:
 
 
 def require_transform_file(path: Path, transform: Transform | None = None) -> None:
-    """Raise `InputError` unless files of this ending hold transforms, and this one if it is given."""
+    """Raise `InputError` unless files of this ending can hold transforms, and this transform if it is given."""
     ending = suffix(path)
     if ending not in (*COMPOSITES, *AFFINES, *FIELDS):
         known = ", ".join((*COMPOSITES, *AFFINES, *FIELDS))
@@ -116,30 +116,33 @@ def require_transform_file(path: Path, transform: Transform | None = None) -> No
     if transform is None:
         return
     if ending in AFFINES and not all(isinstance(stage, Affine) for stage in transform.stages):
-        raise InputError(f"{path}: {ending} files hold affine maps only, and this has a displacement; use .h5")
+        raise InputError(
+            f"{path}: {ending} files hold affine maps only, but this transform has a displacement; use .h5"
+        )
     if ending in FIELDS and transform.reference is None:
         raise InputError(f"{path}: a displacement field needs a grid; give the fixed image as reference, or use .h5")
 
 
 def read_transform(path: _Path) -> Transform:
-    """Read a transform of ITK, ANTs or this library: its points go from fixed to moving, images the other way.
+    """Read a transform of ITK, ANTs or this library. It maps points from fixed to moving, images the other way.
 
     Args:
-        path: a transform file (``.h5``, ``.tfm``, ``.txt``, ``.mat``, ANTs' ``0GenericAffine.mat`` among them) with
+        path: a transform file (``.h5``, ``.tfm``, ``.txt``, ``.mat``, such as ``0GenericAffine.mat`` of ANTs) with
             linear maps of any kind, displacement fields, or composites of them; or a displacement field as an image
-            (``.nii.gz``, ``.mha``, ``.nrrd``, ANTs' ``1Warp.nii.gz`` among them).
+            (``.nii.gz``, ``.mha``, ``.nrrd``, such as ``1Warp.nii.gz`` of ANTs).
 
     Returns:
-        The transform, float64; its `reference` is the grid of a displacement that comes first.
+        The transform, float64. Its `reference` is the grid of a displacement that comes first.
 
     Raises:
         InputError: the file is missing, damaged, of another kind, or holds a transform that is neither linear nor a
-            displacement field (a B-spline, say).
+            displacement field (for instance a B-spline).
     """
     file = Path(path)
     require_sound(file)
     if suffix(file) in FIELDS:
-        return Transform((Displacement(_double(read_displacement(file))),))
+        field = read_displacement(file)
+        return Transform((Displacement(replace(field, data=field.data.double())),))
     return Transform(tuple(_stages(_load(file), str(path))))
 
 
@@ -160,10 +163,10 @@ def _load(path: Path) -> "sitk.Transform":
 
 
 def _stages(transform: "sitk.Transform", name: str) -> list[Stage]:
-    """Return the stages of ITK's transform, what points meet first coming first: ITK keeps them the other way round."""
+    """Return the stages of ITK's transform in the order in which they are applied to points; ITK stores the reverse."""
     import SimpleITK as sitk
 
-    if transform.IsLinear():  # composites of linear maps too
+    if transform.IsLinear():  # true for composites of linear maps, too
         return [_linear(transform, name)]
     transform = transform.Downcast()
     if isinstance(transform, sitk.CompositeTransform):
@@ -171,11 +174,13 @@ def _stages(transform: "sitk.Transform", name: str) -> list[Stage]:
         return [stage for part in parts for stage in _stages(part, name)]
     if isinstance(transform, sitk.DisplacementFieldTransform):
         return [Displacement(_field_of(transform.GetDisplacementField(), name))]
-    raise InputError(f"{name} holds a {transform.GetName()}, which is not read here; turn it into a displacement field")
+    raise InputError(
+        f"{name} holds a {transform.GetName()}, which cannot be read here; convert it to a displacement field"
+    )
 
 
 def _linear(transform: "sitk.Transform", name: str) -> Affine:
-    """Return a linear map of any kind, read off where it takes the origin and one point on each axis."""
+    """Return a linear map of any kind, found from where it maps the origin and one point on each axis."""
     dim = transform.GetDimension()
     ends = [transform.TransformPoint([_STEP * (k == axis) for k in range(dim)]) for axis in range(-1, dim)]
     offset, *columns = torch.tensor(ends, dtype=torch.float64)
@@ -186,7 +191,7 @@ def _linear(transform: "sitk.Transform", name: str) -> Affine:
 
 
 def _field_of(field: "sitk.Image", name: str) -> Image:
-    """Return a displacement field with its vectors in float64, as composite files hold them."""
+    """Return a displacement field with float64 vectors, as composite files have them."""
     import SimpleITK as sitk
 
     image = itk.to_image(field, name)
@@ -202,10 +207,6 @@ def _to_field(vectors: Image) -> Image:
         hint = "give a vector image like displacement.nii.gz"
         raise InputError(f"{vectors.name} has {parts}, so it is no displacement field; {hint}")
     return replace(vectors, data=itk.to_grid_vectors(vectors.data, vectors))
-
-
-def _double(field: Image) -> Image:
-    return replace(field, data=field.data.double())
 
 
 def _composite(transform: Transform) -> "sitk.Transform":
@@ -235,7 +236,7 @@ _TO_ITK: dict[type, Callable[[Any], "sitk.Transform"]] = {Affine: _affine, Displ
 def _save(transform: "sitk.Transform", path: Path) -> None:
     import SimpleITK as sitk
 
-    with staged(path.parent) as folder:
+    with atomic_folder(path.parent) as folder:
         try:
             with native_stderr():
                 sitk.WriteTransform(transform, str(folder / path.name))

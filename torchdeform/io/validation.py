@@ -1,4 +1,4 @@
-"""What is wrong with a file that ITK would read without a word: it breaks off, or holds NaN where ITK says 0."""
+"""Checks for faults that ITK reads over silently: a file that is cut off, or NaN that ITK turns into 0."""
 
 import gzip
 import math
@@ -12,20 +12,20 @@ from typing import BinaryIO
 import numpy as np
 
 from torchdeform.errors import InputError, nearest_name
-from torchdeform.io.files import beginning, suffix
-from torchdeform.io.headers import about_meta, about_nrrd
+from torchdeform.io.files import read_head, suffix
+from torchdeform.io.headers import check_metaimage, check_nrrd
 
-BROKEN_OFF = "is damaged or incomplete; fetch or export it again"
+DAMAGED = "is damaged or incomplete; fetch or export it again"
 EMPTY = "is empty; fetch or export it again"
 NOT_SQUARE = "has axes that are not at right angles; reslice it onto a rectangular grid first"
 NOT_FINITE = "has pixels that are NaN or infinite; replace them first, for instance by 0"
 
 _Stream = BinaryIO | gzip.GzipFile
-_CHUNK = 1 << 22  # bytes read at once, a multiple of every pixel's size
+_CHUNK = 1 << 22  # bytes read at once, a multiple of the size of every pixel type
 _FLOATS = {16: "f4", 64: "f8"}  # NIfTI's datatype codes
 
 
-# What files begin with (or have at a position), and the ending that tells it.
+# Position, magic bytes there, and the ending of files that have them.
 _KINDS = (
     (0, b"NRRD", ".nrrd"),
     (0, b"ObjectType", ".mha"),
@@ -45,7 +45,7 @@ _ALIKE = {".mhd": ".mha", ".nhdr": ".nrrd", ".tiff": ".tif", ".jpeg": ".jpg"}
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where a NIfTI header keeps dim, datatype, bitpix, pixdim and vox_offset, as (format, position)."""
+    """Where a NIfTI header has dim, datatype, bitpix, pixdim and vox_offset, as (format, position)."""
 
     dim: tuple[str, int]
     datatype: tuple[str, int]
@@ -54,7 +54,7 @@ class _Layout:
     offset: tuple[str, int]
 
 
-# By the number that the header starts with, its length.
+# By the number that the header starts with, which is its length.
 _NIFTI = {
     348: _Layout(("8h", 40), ("h", 70), ("h", 72), ("8f", 76), ("f", 108)),
     540: _Layout(("8q", 16), ("h", 12), ("h", 14), ("8d", 104), ("q", 168)),
@@ -62,7 +62,7 @@ _NIFTI = {
 
 
 def require_sound(path: Path) -> None:
-    """Raise `InputError` unless ``path`` is a file that can be opened and that nothing is visibly wrong with."""
+    """Raise `InputError` unless ``path`` is a file that can be opened and has no visible fault."""
     if not path.exists():
         near = nearest_name(path.name, (p.name for p in path.parent.iterdir())) if path.parent.is_dir() else ""
         raise InputError(f"{path} does not exist; check the name{near}")
@@ -71,72 +71,68 @@ def require_sound(path: Path) -> None:
     if not path.is_file():
         raise InputError(f"{path} is no file but a device or a pipe; give an image file")
     try:
-        complaint = _COMPLAINTS.get(suffix(path), _about_nothing)(path) if path.stat().st_size else EMPTY
+        fault = _CHECKS.get(suffix(path), lambda _: None)(path) if path.stat().st_size else EMPTY
         path.open("rb").close()
     except OSError as error:
         raise InputError(f"{path} cannot be opened: {error.strerror}; check its permissions") from error
-    if complaint:
-        raise InputError(f"{path} {complaint}")
+    if fault:
+        raise InputError(f"{path} {fault}")
 
 
 def other_kind(path: Path) -> str:
-    """Return the ending that fits what the file holds, or an empty string if that is not known or is what it has."""
-    head = beginning(path, 512)
+    """Return the ending that fits the content of the file; empty if unknown, or if the file has that ending."""
+    head = read_head(path, 512)
     kind = next((ending for start, magic, ending in _KINDS if head[start:].startswith(magic)), "")
     return "" if suffix(path).endswith(kind) or kind == _ALIKE.get(suffix(path)) else kind
 
 
-def _about_nothing(_: Path) -> None:
-    return None
-
-
-def _about_jpeg(path: Path) -> str | None:
-    """The last scan (FF DA) must be followed by the end of the image (FF D9); neither occurs inside coded pixels."""
+def _check_jpeg(path: Path) -> str | None:
+    """The end of the image (FF D9) must follow the last scan (FF DA). Neither occurs inside coded pixels."""
     content = path.read_bytes()
-    return None if content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda") else BROKEN_OFF
+    return None if content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda") else DAMAGED
 
 
-def _about_bmp(path: Path) -> str | None:
-    """The header tells the size of the file."""
-    return None if int.from_bytes(beginning(path, 6)[2:], "little") <= path.stat().st_size else BROKEN_OFF
+def _check_bmp(path: Path) -> str | None:
+    """The header holds the size of the file."""
+    return None if int.from_bytes(read_head(path, 6)[2:], "little") <= path.stat().st_size else DAMAGED
 
 
-def _about_nifti(path: Path) -> str | None:
+def _check_nifti(path: Path) -> str | None:
     try:
         with path.open("rb") if suffix(path) == ".nii" else gzip.open(path) as file:
-            return _about_voxels(file)
+            return _check_voxels(file)
     except gzip.BadGzipFile:
         known = other_kind(path)
-        return f"is not compressed but a {known} file; rename it" if known else BROKEN_OFF
+        return f"is not compressed but a {known} file; rename it" if known else DAMAGED
     except (EOFError, zlib.error):
-        return BROKEN_OFF
+        return DAMAGED
 
 
-def _about_voxels(file: _Stream) -> str | None:
-    """Read a NIfTI stream from header to end; what is no NIfTI is left to others to judge."""
+def _check_voxels(file: _Stream) -> str | None:
+    """Read a NIfTI stream from header to end. What is no NIfTI is no fault here."""
     head = file.read(540)
     if len(head) < 348:
-        return BROKEN_OFF
+        return DAMAGED
     for order in "<>":
         layout = _NIFTI.get(struct.unpack_from(order + "i", head)[0])
         if layout is not None and len(head) >= layout.offset[1] + 8:
-            return _about_header(head, order, layout) or _about_body(file, head, order, layout)
+            return _check_header(head, order, layout) or _check_body(file, head, order, layout)
     return None
 
 
-def _about_header(head: bytes, order: str, layout: _Layout) -> str | None:
-    """Sizes, spacings and the place of the voxels must be numbers that make sense; the library below mends them."""
+def _check_header(head: bytes, order: str, layout: _Layout) -> str | None:
+    """Sizes, spacings and the position of the voxels must make sense: NIfTI's library would change them silently."""
     rank, *sizes = _field(head, order, layout.dim)
     if not 1 <= rank <= 7 or min(sizes[:rank]) < 1:
-        return f"has the size {sizes[: min(max(rank, 0), 7)]} in its header; mend the header"
+        return f"has the size {sizes[: min(max(rank, 0), 7)]} in its header; correct the header"
     spacing = [h for h, n in zip(_field(head, order, layout.pixdim)[1:4], sizes[: min(rank, 3)], strict=False) if n > 1]
     if not all(math.isfinite(h) and h != 0 for h in spacing):
-        return f"has the spacing {spacing} in its header; mend the header"
+        return f"has the spacing {spacing} in its header; correct the header"
     offset = _field(head, order, layout.offset)[0]
-    return None if math.isfinite(offset) and offset >= 0 else BROKEN_OFF
+    return None if math.isfinite(offset) and offset >= 0 else DAMAGED
 
 
-def _about_body(file: _Stream, head: bytes, order: str, layout: _Layout) -> str | None:
+def _check_body(file: _Stream, head: bytes, order: str, layout: _Layout) -> str | None:
     rank, *sizes = _field(head, order, layout.dim)
     missing = math.prod(sizes[:rank]) * _field(head, order, layout.bitpix)[0] // 8
     kind = _FLOATS.get(_field(head, order, layout.datatype)[0])
@@ -146,23 +142,23 @@ def _about_body(file: _Stream, head: bytes, order: str, layout: _Layout) -> str 
         missing -= len(chunk)
         if kind and len(chunk) % int(kind[1]) == 0:
             finite = finite and bool(np.isfinite(np.frombuffer(chunk, order + kind)).all())
-    while file.read(_CHUNK):  # to the end, where a compressed file has its checksum
+    while file.read(_CHUNK):  # a compressed file has its checksum at the end
         pass
-    return BROKEN_OFF if missing else None if finite else NOT_FINITE
+    return DAMAGED if missing else None if finite else NOT_FINITE
 
 
 def _field(head: bytes, order: str, field: tuple[str, int]) -> tuple[int, ...]:
     return struct.unpack_from(order + field[0], head, field[1])
 
 
-_COMPLAINTS: dict[str, Callable[[Path], str | None]] = {
-    ".jpg": _about_jpeg,
-    ".jpeg": _about_jpeg,
-    ".bmp": _about_bmp,
-    ".mha": about_meta,
-    ".mhd": about_meta,
-    ".nrrd": about_nrrd,
-    ".nhdr": about_nrrd,
-    ".nii": _about_nifti,
-    ".nii.gz": _about_nifti,
+_CHECKS: dict[str, Callable[[Path], str | None]] = {
+    ".jpg": _check_jpeg,
+    ".jpeg": _check_jpeg,
+    ".bmp": _check_bmp,
+    ".mha": check_metaimage,
+    ".mhd": check_metaimage,
+    ".nrrd": check_nrrd,
+    ".nhdr": check_nrrd,
+    ".nii": _check_nifti,
+    ".nii.gz": _check_nifti,
 }

@@ -12,7 +12,7 @@ from torchdeform.errors import InputError
 _DIMENSIONS = (4, 5)
 
 # Intensities that are taken for 0 and 1; None: the smallest and the largest of each image.
-Span = tuple[float, float] | None
+IntensityRange = tuple[float, float] | None
 
 
 class Similarity(ABC):
@@ -72,19 +72,19 @@ def _check_mask(mask: Tensor, image: Tensor) -> None:
         raise InputError(f"similarity: mask must have shape {(items, 1, *shape)}, got {tuple(mask.shape)}")
 
 
-def times(x: Tensor, weight: Tensor | None) -> Tensor:
+def weighted(x: Tensor, weight: Tensor | None) -> Tensor:
     """Return weight · x, or x itself without a weight."""
     return x if weight is None else x * weight
 
 
 def mean(x: Tensor, weight: Tensor | None = None) -> Tensor:
     """Return the mean of weight · x over voxels and channels, ``(B,)``."""
-    return times(x, weight).flatten(1).mean(1)
+    return weighted(x, weight).flatten(1).mean(1)
 
 
 def channel_mean(x: Tensor, weight: Tensor | None = None) -> Tensor:
     """Return the mean of weight · x over voxels, ``(B, C, 1, ..)``."""
-    return times(x, weight).mean(dim=tuple(range(2, x.dim())), keepdim=True)
+    return weighted(x, weight).mean(dim=tuple(range(2, x.dim())), keepdim=True)
 
 
 def checked(fixed: Tensor, warped: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -104,26 +104,28 @@ def checked(fixed: Tensor, warped: Tensor, mask: Tensor | None) -> tuple[Tensor,
     return at_least_float32(fixed), at_least_float32(warped)
 
 
-def on_unit_scale(fixed: Tensor, warped: Tensor, mask: Tensor | None, span: Span) -> tuple[Tensor, Tensor]:
+def on_unit_scale(
+    fixed: Tensor, warped: Tensor, mask: Tensor | None, intensity_range: IntensityRange
+) -> tuple[Tensor, Tensor]:
     """Return (image − low) / (high − low) of both images, at least in float32.
 
     Args:
         fixed: ``(B, C, *S)``, any unit.
         warped: the same shape, any unit.
         mask: ``(B or 1, 1, *S)`` or None.
-        span: low and high of both; None takes the smallest and the largest value of each channel of each image where
-            the mask is positive, as constants: no derivative goes through them. A flat channel becomes 0.
+        intensity_range: low and high of both; None takes the smallest and the largest value of each channel of each
+            image where the mask is positive, as constants: no derivative goes through them. A flat channel becomes 0.
 
     Raises:
         InputError: as `checked`.
     """
     fixed, warped = checked(fixed, warped, mask)
-    return _to_unit(fixed, mask, span), _to_unit(warped, mask, span)
+    return _to_unit(fixed, mask, intensity_range), _to_unit(warped, mask, intensity_range)
 
 
-def _to_unit(image: Tensor, mask: Tensor | None, span: Span) -> Tensor:
-    if span is not None:
-        return (image - span[0]) / (span[1] - span[0])
+def _to_unit(image: Tensor, mask: Tensor | None, intensity_range: IntensityRange) -> Tensor:
+    if intensity_range is not None:
+        return (image - intensity_range[0]) / (intensity_range[1] - intensity_range[0])
     with torch.no_grad():
         outside = torch.zeros_like(image, dtype=torch.bool) if mask is None else (mask <= 0).expand_as(image)
         voxels = tuple(range(2, image.dim()))

@@ -8,14 +8,14 @@ from torch import Tensor
 
 from torchdeform.core.resampling import box_spread, box_sum, centres
 from torchdeform.metrics.base import (
+    IntensityRange,
     Similarity,
-    Span,
     at_least_float32,
     channel_mean,
     mean,
     on_unit_scale,
     relative_weight,
-    times,
+    weighted,
 )
 
 # Added to both variances of LNCC, for images scaled to [0, 1]: windows flatter than a grey level of 0.3 % are flat.
@@ -53,18 +53,18 @@ class CrossCorrelation(Similarity):
         warped, variance = _centred(warped, weight)
         scale = (fixed_variance * variance).rsqrt()
         value = channel_mean(fixed * warped, weight) * scale
-        return value.flatten(1).mean(1), times(scale * fixed - (value / variance) * warped, weight)
+        return value.flatten(1).mean(1), weighted(scale * fixed - (value / variance) * warped, weight)
 
 
-def ncc(fixed: Tensor, warped: Tensor, *, mask: Tensor | None = None, span: Span = None) -> Tensor:
+def ncc(fixed: Tensor, warped: Tensor, *, mask: Tensor | None = None, intensity_range: IntensityRange = None) -> Tensor:
     """Return S = c / √((v_f + ε)(v_w + ε)), the correlation of two images, 1 at best and −1 for reversed contrast.
 
     Args:
         fixed: ``(B, C, *S)``, any unit.
         warped: the same shape, any unit.
         mask: weight of each voxel ``(B, 1, *S)``, 0 to 1; all ones when None.
-        span: intensities taken for 0 and 1, which gives ε = 1e-8 its meaning; None: the smallest and the largest of
-            each image where the mask is positive.
+        intensity_range: intensities taken for 0 and 1, which gives ε = 1e-8 its meaning; None: the smallest and the
+            largest of each image where the mask is positive.
 
     Returns:
         ``(B,)``, the mean over channels. Flat images give 0.
@@ -75,7 +75,7 @@ def ncc(fixed: Tensor, warped: Tensor, *, mask: Tensor | None = None, span: Span
     Notes:
         Differentiable. `CrossCorrelation` has the derivative in closed form.
     """
-    fixed, warped = on_unit_scale(fixed, warped, mask, span)
+    fixed, warped = on_unit_scale(fixed, warped, mask, intensity_range)
     weight = relative_weight(mask, warped)
     (fixed, fixed_variance), (warped, variance) = _centred(fixed, weight), _centred(warped, weight)
     return (channel_mean(fixed * warped, weight) * (fixed_variance * variance).rsqrt()).flatten(1).mean(1)
@@ -93,15 +93,15 @@ class _Windows:
 
     Attributes:
         weight: of the voxels ``(B or 1, 1, *S)``, 1 on average; None for 1 everywhere.
-        own: weight of a window, that of the voxel in its middle, 1 on average; None for 1 everywhere.
-        share: 1 / weight of its voxels.
+        window_weight: of a window, that of the voxel in its middle, 1 on average; None for 1 everywhere.
+        inverse_count: 1 / weight of its voxels.
         mean: of the fixed image in it.
         variance: of the fixed image in it, + ε.
     """
 
     weight: Tensor | None
-    own: Tensor | None
-    share: Tensor
+    window_weight: Tensor | None
+    inverse_count: Tensor
     mean: Tensor
     variance: Tensor
 
@@ -139,19 +139,20 @@ class LocalCrossCorrelation(Similarity):
     @torch.no_grad()
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         warped = at_least_float32(warped)
-        around = self._windows(mask, warped)
-        sums = box_sum(_products(warped, self.fixed, around.weight), self.window, self.stride).mul_(around.share)
+        windows = self._windows(mask, warped)
+        sums = box_sum(_products(warped, self.fixed, windows.weight), self.window, self.stride)
+        sums.mul_(windows.inverse_count)
         warped_mean, square, product = sums.chunk(3, dim=1)
-        covariance = product.addcmul_(warped_mean, around.mean, value=-1)
+        covariance = product.addcmul_(warped_mean, windows.mean, value=-1)
         variance = square.addcmul_(warped_mean, warped_mean, value=-1).clamp_(min=0).add_(LNCC_FLOOR)
-        correlation = times(covariance / (variance * around.variance), around.own)
+        correlation = weighted(covariance / (variance * windows.variance), windows.window_weight)
         value = mean(correlation * covariance)
-        a = correlation.mul_(around.share * (2 * warped[0, 0].numel() / correlation[0, 0].numel()))
+        a = correlation.mul_(windows.inverse_count * (2 * warped[0, 0].numel() / correlation[0, 0].numel()))
         b = a * covariance / variance
-        back = torch.cat([a, b, b * warped_mean - a * around.mean], dim=1)
+        back = torch.cat([a, b, b * warped_mean - a * windows.mean], dim=1)
         a, b, rest = box_spread(back, self.window, self.stride, tuple(warped.shape[2:])).chunk(3, dim=1)
         slope = torch.addcmul(rest, self.fixed, a).addcmul_(warped, b, value=-1)
-        return value, slope if around.weight is None else slope.mul_(around.weight)
+        return value, slope if windows.weight is None else slope.mul_(windows.weight)
 
 
 def lncc(
@@ -160,7 +161,7 @@ def lncc(
     *,
     mask: Tensor | None = None,
     window: int = 9,
-    span: Span = None,
+    intensity_range: IntensityRange = None,
     stride: int = 1,
 ) -> Tensor:
     """Return S = mean over x of c² / ((v_f + ε)(v_w + ε)), covariance and variances in the window around x.
@@ -170,8 +171,8 @@ def lncc(
         warped: the same shape, any unit.
         mask: weight of each voxel ``(B, 1, *S)``, 0 to 1, in the windows and of the windows; all ones when None.
         window: width in voxels, odd. At the boundary the part of the window inside the image counts.
-        span: intensities taken for 0 and 1, which gives ε = 1e-5 its meaning; None: the smallest and the largest of
-            each image where the mask is positive.
+        intensity_range: intensities taken for 0 and 1, which gives ε = 1e-5 its meaning; None: the smallest and the
+            largest of each image where the mask is positive.
         stride: voxels from one x to the next along every axis.
 
     Returns:
@@ -183,25 +184,28 @@ def lncc(
     Notes:
         Differentiable. `LocalCrossCorrelation` has the derivative in closed form.
     """
-    fixed, warped = on_unit_scale(fixed, warped, mask, span)
-    around = _windows(fixed, relative_weight(mask, warped), window, stride)
-    warped_mean, variance = _moments(warped, around.weight, around.share, window, stride)
-    product = box_sum(times(fixed * warped, around.weight), window, stride) * around.share
-    covariance = product - around.mean * warped_mean
-    return mean(covariance.square() / (around.variance * variance), around.own)
+    fixed, warped = on_unit_scale(fixed, warped, mask, intensity_range)
+    windows = _windows(fixed, relative_weight(mask, warped), window, stride)
+    warped_mean, variance = _moments(warped, windows.weight, windows.inverse_count, window, stride)
+    product = box_sum(weighted(fixed * warped, windows.weight), window, stride) * windows.inverse_count
+    covariance = product - windows.mean * warped_mean
+    return mean(covariance.square() / (windows.variance * variance), windows.window_weight)
 
 
 def _windows(fixed: Tensor, weight: Tensor | None, window: int, stride: int) -> _Windows:
     ones = fixed.new_ones(1, 1, *fixed.shape[2:]) if weight is None else weight
-    share = 1 / box_sum(ones, window, stride).clamp(min=_EMPTY)
-    own = None if weight is None else relative_weight(middle := centres(weight, stride), middle)
-    return _Windows(weight, own, share, *_moments(fixed, weight, share, window, stride))
+    inverse_count = 1 / box_sum(ones, window, stride).clamp(min=_EMPTY)
+    window_weight = None if weight is None else relative_weight(middle := centres(weight, stride), middle)
+    return _Windows(weight, window_weight, inverse_count, *_moments(fixed, weight, inverse_count, window, stride))
 
 
-def _moments(image: Tensor, weight: Tensor | None, share: Tensor, window: int, stride: int) -> tuple[Tensor, Tensor]:
+def _moments(
+    image: Tensor, weight: Tensor | None, inverse_count: Tensor, window: int, stride: int
+) -> tuple[Tensor, Tensor]:
     """Return mean and variance + ε in the window around each voxel."""
-    weighted = times(image, weight)
-    first, square = (box_sum(torch.cat([weighted, weighted * image], dim=1), window, stride) * share).chunk(2, dim=1)
+    first = weighted(image, weight)
+    sums = box_sum(torch.cat([first, first * image], dim=1), window, stride)
+    first, square = (sums * inverse_count).chunk(2, dim=1)
     return first, (square - first * first).clamp(min=0) + LNCC_FLOOR
 
 
@@ -209,23 +213,23 @@ def _products(warped: Tensor, fixed: Tensor, weight: Tensor | None) -> Tensor:
     """Return weight · warped, weight · warped² and weight · warped · fixed side by side; no memory but theirs."""
     items, channels, *shape = warped.shape
     fields = warped.new_empty(items, 3 * channels, *shape)
-    weighted, square, product = fields.chunk(3, dim=1)
-    weighted.copy_(warped)
+    first, square, product = fields.chunk(3, dim=1)
+    first.copy_(warped)
     if weight is not None:
-        weighted.mul_(weight)
-    torch.mul(weighted, warped, out=square)
-    torch.mul(weighted, fixed, out=product)
+        first.mul_(weight)
+    torch.mul(first, warped, out=square)
+    torch.mul(first, fixed, out=product)
     return fields
 
 
-# Windows with this standard deviation count half, on the scale where the image's range is 1.
-_DETAIL = 0.01
+# Windows of this standard deviation have weight 1/2 in `ForegroundLNCC`; the image's range is 1.
+_FOREGROUND = 0.01
 
-# Images are multiplied by this, which makes the floor of LNCC that much smaller than the detail.
+# Images are multiplied by this, so that ε of LNCC is small against the square of that deviation.
 _GAIN = 10.0
 
 
-class DetailCorrelation(Similarity):
+class ForegroundLNCC(Similarity):
     """S = mean of LNCC over x, weighted by t(x) = v² / (v² + τ⁴), v being the variance of the fixed image around x.
 
     Args:
@@ -233,21 +237,21 @@ class DetailCorrelation(Similarity):
         window: width in voxels, odd.
 
     Notes:
-        LNCC adds ε to both variances, so a flat window counts as not correlated, and a map that enlarges the moving
-        image until something covers the background gains. With t, and with ε small against τ², S is 1 for images that
-        agree, and the map that is found is the true one: blobs of 10 voxels on an empty background came out up to
-        5 voxels off with LNCC, and are less than 0.1 off with this.
+        LNCC adds ε to both variances, so a flat window counts as not correlated. A map that enlarges the moving image
+        until it covers the background then raises LNCC. With t, and with ε small against τ², S is 1 for images that
+        agree, and the best map is the true one: the map of blobs of 10 voxels on an empty background was up to 5 voxels
+        off with LNCC, and is less than 0.1 off with this.
     """
 
     def __init__(self, fixed: Tensor, window: int) -> None:
-        self.inner = LocalCrossCorrelation(fixed * _GAIN, window)
+        self.lncc = LocalCrossCorrelation(fixed * _GAIN, window)
         ones = torch.ones_like(fixed[:, :1])
         count = box_sum(ones, window)
         mean = box_sum(fixed, window) / count
         variance = (box_sum(fixed * fixed, window) / count - mean * mean).clamp(min=0).amax(1, keepdim=True)
-        self.detail = variance**2 / (variance**2 + _DETAIL**4)
+        self.foreground = variance**2 / (variance**2 + _FOREGROUND**4)
 
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        weight = self.detail.expand(len(warped), *self.detail.shape[1:])
-        value, derivative = self.inner.evaluate(warped * _GAIN, weight if mask is None else mask * weight)
+        weight = self.foreground.expand(len(warped), *self.foreground.shape[1:])
+        value, derivative = self.lncc.evaluate(warped * _GAIN, weight if mask is None else mask * weight)
         return value, derivative * _GAIN

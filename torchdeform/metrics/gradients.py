@@ -6,13 +6,13 @@ from torch import Tensor
 from torchdeform.core.derivatives import add_adjoint_derivative, derivative
 from torchdeform.core.grid import Grid
 from torchdeform.metrics.base import (
+    IntensityRange,
     Similarity,
-    Span,
     at_least_float32,
     mean,
     on_unit_scale,
     relative_weight,
-    times,
+    weighted,
 )
 
 # The smallest edge, in grey levels a voxel of images scaled to [0, 1].
@@ -50,9 +50,9 @@ class GradientFields(Similarity):
         along = _dot(self.direction, gradient)
         ratio = along / (_squares(gradient) + self.square)
         value = mean(along.mul_(ratio), weight)
-        pull, total = times(2 * ratio, weight), torch.zeros_like(warped)
+        factor, total = weighted(2 * ratio, weight), torch.zeros_like(warped)
         for axis, (p, g) in enumerate(zip(self.direction, gradient, strict=True)):
-            add_adjoint_derivative(total, torch.addcmul(p, ratio, g, value=-1).mul_(pull), self.grid, axis)
+            add_adjoint_derivative(total, torch.addcmul(p, ratio, g, value=-1).mul_(factor), self.grid, axis)
         return value, total
 
 
@@ -63,7 +63,7 @@ def ngf(
     mask: Tensor | None = None,
     grid: Grid | None = None,
     edge: float = 0.1,
-    span: Span = None,
+    intensity_range: IntensityRange = None,
 ) -> Tensor:
     """Return S = mean (∇f · ∇w)² / ((|∇f|² + η²)(|∇w|² + η²)), for images of different contrast.
 
@@ -74,8 +74,8 @@ def ngf(
             among those that its differences use.
         grid: their grid; spacing 1 when None.
         edge: η in units of the mean of |∇f|; shorter gradients count as noise. From 1 on, steeper is more similar.
-        span: intensities taken for 0 and 1, so that one η suits both images; None: the smallest and the largest of each
-            image where the mask is positive.
+        intensity_range: intensities taken for 0 and 1, so that one η suits both images; None: the smallest and the
+            largest of each image where the mask is positive.
 
     Returns:
         ``(B,)`` between 0 and 1. Flat regions give 0.
@@ -87,7 +87,7 @@ def ngf(
         Differentiable, η being a constant. `GradientFields` has the derivative in closed form. Haber & Modersitzki,
         "Intensity gradient based registration and fusion of multi-modal images", 2007.
     """
-    fixed, warped = on_unit_scale(fixed, warped, mask, span)
+    fixed, warped = on_unit_scale(fixed, warped, mask, intensity_range)
     grid = grid or Grid(tuple(fixed.shape[2:]))
     weight = relative_weight(_smallest_in_stencil(mask), warped)
     f, w = _gradient(fixed, grid), _gradient(warped, grid)

@@ -8,12 +8,12 @@ from torch import Tensor
 
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import (
+    IntensityRange,
     Similarity,
-    Span,
     at_least_float32,
     on_unit_scale,
     relative_weight,
-    times,
+    weighted,
 )
 
 # The kernels as polynomials: row k holds the coefficients of 1, t, t², .. of what bin i + k gets from a value that lies
@@ -72,7 +72,7 @@ class MutualInformation(Similarity):
         moments = self._moments(flat, None if weight is None else weight.expand_as(warped).flatten(), tables)
         value, slope = self.measure(self._table(moments / warped[0, 0].numel()))
         derivative = self._derivative(flat, self._coefficients(slope).to(flat.dtype)).view(warped.shape)
-        return value.view(warped.shape[:2]).mean(1).to(warped.dtype), times(derivative, weight)
+        return value.view(warped.shape[:2]).mean(1).to(warped.dtype), weighted(derivative, weight)
 
     def _locate(self, warped: Tensor, piece: slice) -> tuple[Tensor, Tensor, Tensor]:
         """Return the cell (i, j) of some voxels, and t and s, the places inside it."""
@@ -118,7 +118,7 @@ class MutualInformation(Similarity):
 
 
 def mutual_information(
-    fixed: Tensor, warped: Tensor, *, mask: Tensor | None = None, bins: int = 32, span: Span = None
+    fixed: Tensor, warped: Tensor, *, mask: Tensor | None = None, bins: int = 32, intensity_range: IntensityRange = None
 ) -> Tensor:
     """Return S = Σ P log(P / (P_w P_f)), P being the joint histogram of warped and fixed intensities.
 
@@ -127,8 +127,8 @@ def mutual_information(
         warped: the same shape, any unit.
         mask: weight of each voxel ``(B, 1, *S)``, 0 to 1; all ones when None.
         bins: along each axis of the histogram, at least 5.
-        span: intensities of the first and the last bin, what lies outside counts there; None: the smallest and the
-            largest of each image where the mask is positive.
+        intensity_range: intensities of the first and the last bin, which also get what is outside; None: the smallest
+            and the largest of each image where the mask is positive.
 
     Returns:
         ``(B,)`` in nats, the mean over channels; 0 for independent images.
@@ -138,13 +138,13 @@ def mutual_information(
 
     Notes:
         Bins overlap as in `MutualInformation`, which has the derivative in closed form. Differentiable, no derivative
-        going through the span. Viola & Wells 1997; Thévenaz & Unser 2000.
+        going through the range. Viola & Wells 1997; Thévenaz & Unser 2000.
     """
-    return _from_images((fixed, warped), mask, bins, span, _mutual)
+    return _from_images((fixed, warped), mask, bins, intensity_range, _mutual)
 
 
 def normalised_mutual_information(
-    fixed: Tensor, warped: Tensor, *, mask: Tensor | None = None, bins: int = 32, span: Span = None
+    fixed: Tensor, warped: Tensor, *, mask: Tensor | None = None, bins: int = 32, intensity_range: IntensityRange = None
 ) -> Tensor:
     """Return S = (H_w + H_f) / H, the entropies of warped, of fixed and of both together.
 
@@ -153,7 +153,7 @@ def normalised_mutual_information(
         warped: the same shape, any unit.
         mask: weight of each voxel ``(B, 1, *S)``, 0 to 1; all ones when None.
         bins: as for `mutual_information`.
-        span: as for `mutual_information`.
+        intensity_range: as for `mutual_information`.
 
     Returns:
         ``(B,)`` between 1 and 2, the mean over channels; 1 for independent images.
@@ -165,22 +165,22 @@ def normalised_mutual_information(
         As `mutual_information`, but does not grow with the part of the images that overlaps. Studholme, Hill & Hawkes,
         "An overlap invariant entropy measure of 3D medical image alignment", 1999.
     """
-    return _from_images((fixed, warped), mask, bins, span, _normalised)
+    return _from_images((fixed, warped), mask, bins, intensity_range, _normalised)
 
 
 def _from_images(
-    images: tuple[Tensor, Tensor], mask: Tensor | None, bins: int, span: Span, measure: _Measure
+    images: tuple[Tensor, Tensor], mask: Tensor | None, bins: int, intensity_range: IntensityRange, measure: _Measure
 ) -> Tensor:
     """Return S from the histogram itself, summed in float64, which autograd can follow."""
     _checked_bins(bins)
-    fixed, warped = on_unit_scale(*images, mask, span)
+    fixed, warped = on_unit_scale(*images, mask, intensity_range)
     weight = relative_weight(mask, warped)
     column, s = _cells(fixed, bins - 1)
     row, t = _cells(warped, bins - 3)
     cell = (_first_cells(warped, bins**2) + row * bins + column).flatten()
     table = torch.zeros(warped.shape[0] * warped.shape[1] * bins**2, dtype=torch.float64, device=warped.device)
     for (k, cubic), (m, linear) in product(enumerate(_CUBIC), enumerate(_LINEAR)):
-        share = times(_polynomial(cubic, t) * _polynomial(linear, s), weight)
+        share = weighted(_polynomial(cubic, t) * _polynomial(linear, s), weight)
         table = table.scatter_add(0, cell + k * bins + m, share.double().flatten())
     value, _ = measure(table.view(-1, bins, bins) / warped[0, 0].numel())
     return value.view(warped.shape[:2]).mean(1).to(warped.dtype)

@@ -1,56 +1,127 @@
-"""Similarities by name: which features are compared, by what, and with which weight."""
+"""The table of similarity measures, and the similarity of two images by name: one measure or several with weights."""
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import accumulate, pairwise
 from numbers import Real
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError, require_choice
-from torchdeform.metrics.base import Similarity, at_least_float32
-from torchdeform.metrics.correlation import CrossCorrelation, LocalCrossCorrelation
-from torchdeform.metrics.gradients import GradientFields
-from torchdeform.metrics.information import MutualInformation
+from torchdeform.metrics.base import Similarity
+from torchdeform.metrics.correlation import CrossCorrelation, LocalCrossCorrelation, lncc, ncc
+from torchdeform.metrics.gradients import GradientFields, ngf
+from torchdeform.metrics.information import MutualInformation, mutual_information, normalised_mutual_information
 from torchdeform.metrics.mind import mind_ssc, neighbour_pairs
-from torchdeform.metrics.squares import MeanSquaredDifference
+from torchdeform.metrics.squares import MeanSquaredDifference, mind, ssd
+
+
+@dataclass(frozen=True)
+class Features:
+    """What of an image is warped and compared.
+
+    Attributes:
+        of: returns the features ``(B, C·K, *S)`` of an image ``(B, C, *S)``.
+        count: returns K, by the dimension.
+    """
+
+    of: Callable[[Tensor], Tensor]
+    count: Callable[[int], int]
+
+
+INTENSITIES = Features(lambda image: image, lambda dim: 1)
+SELF_SIMILARITIES = Features(mind_ssc, lambda dim: len(neighbour_pairs(dim)))
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A similarity measure: all that the package knows about it.
+
+    Attributes:
+        function: S(fixed, warped, mask=..) of two images, ``(B,)``, higher is better; autograd has its derivative.
+        closed_form: returns the `Similarity` to the features of the fixed image, which knows its derivative.
+        memory: bytes that a registration holds for each voxel and channel, in 2D and in 3D, measured by
+            ``scripts/benchmarks/memory.py``.
+        time: time of a step over that of a step with LNCC.
+        options: what both take of ``window`` (width in voxels) and ``grid``.
+        features: what of the images is compared.
+        common_scale: whether intensities are compared as they are, so that both images need one scale.
+        references: keys in ``references.bib``; none for what is common property.
+    """
+
+    function: Callable[..., Tensor]
+    closed_form: Callable[..., Similarity]
+    memory: tuple[float, float]
+    time: float
+    options: tuple[str, ...] = ()
+    features: Features = INTENSITIES
+    common_scale: bool = False
+    references: tuple[str, ...] = ()
+
+    def choose(self, **available: object) -> dict[str, Any]:
+        """Return those of the options ``window`` and ``grid`` that this measure takes."""
+        return {name: available[name] for name in self.options}
+
 
 # Windows of LNCC over a voxel along each axis. With 3 in place of 9 it takes a fifth of the time; Dice changes by
 # +0.002 (mouse brains), +0.001 (slices, hearts), 0.000 (hippocampi).
 _WINDOWS_OVER = 3
 
-# The measures of images, by name: from the fixed image, the window of LNCC and the grid.
-_OF_IMAGES: dict[str, Callable[[Tensor, int, Grid], Similarity]] = {
-    "ssd": lambda fixed, window, grid: MeanSquaredDifference(fixed),
-    "ncc": lambda fixed, window, grid: CrossCorrelation(fixed),
-    "lncc": lambda fixed, window, grid: LocalCrossCorrelation(fixed, window, max(1, window // _WINDOWS_OVER)),
-    "mi": lambda fixed, window, grid: MutualInformation(fixed),
-    "nmi": lambda fixed, window, grid: MutualInformation(fixed, normalised=True),
-    "ngf": lambda fixed, window, grid: GradientFields(fixed, grid),
+
+def _sparse_lncc(fixed: Tensor, window: int) -> Similarity:
+    return LocalCrossCorrelation(fixed, window, max(1, window // _WINDOWS_OVER))
+
+
+_NMI = partial(MutualInformation, normalised=True)
+_MI_PAPERS = ("viola1997alignment", "thevenaz2000optimization")
+
+# The one table of measures, by their names in settings: settings, layers, memory, time and citations all read it, so a
+# new measure is a new row.
+MEASURES = {
+    "ssd": Measure(ssd, MeanSquaredDifference, (60.0, 55.0), 0.7, common_scale=True),
+    "ncc": Measure(ncc, CrossCorrelation, (60.0, 55.0), 0.7),
+    "lncc": Measure(lncc, _sparse_lncc, (45.0, 40.0), 1.0, ("window",), references=("avants2008symmetric",)),
+    "mi": Measure(mutual_information, MutualInformation, (60.0, 50.0), 1.1, references=_MI_PAPERS),
+    "nmi": Measure(normalised_mutual_information, _NMI, (60.0, 50.0), 1.1, references=("studholme1999overlap",)),
+    "ngf": Measure(ngf, GradientFields, (75.0, 60.0), 1.0, ("grid",), references=("haber2006intensity",)),
+    "mind": Measure(
+        mind, MeanSquaredDifference, (140.0, 300.0), 1.5, (), SELF_SIMILARITIES, references=("heinrich2013towards",)
+    ),
 }
-
-
-SIMILARITIES = ("ssd", "ncc", "lncc", "mi", "nmi", "ngf", "mind")
 
 
 def similarity_weights(similarity: str | Mapping[str, float]) -> dict[str, float]:
     """Return the measures that a setting ``similarity`` names, with their weights.
 
     Args:
-        similarity: a name of `SIMILARITIES`, which has weight 1, or names with their weights.
+        similarity: a name of `MEASURES`, which has weight 1, or names with their weights.
 
     Raises:
         InputError: no name, an unknown one, or a weight that is not positive and finite.
     """
     if not isinstance(similarity, str | Mapping) or not similarity:
-        raise InputError(f"similarity must name one of {', '.join(SIMILARITIES)}, or several with their weights")
+        raise InputError(f"similarity must name one of {', '.join(MEASURES)}, or several with their weights")
     weights = {similarity: 1.0} if isinstance(similarity, str) else dict(similarity)
     for name, weight in weights.items():
-        require_choice(name, SIMILARITIES, "similarity")
+        require_choice(name, MEASURES, "similarity")
         if isinstance(weight, bool) or not isinstance(weight, Real) or not 0 < weight < math.inf:
             raise InputError(f"similarity: the weight of {name} must be a positive finite number, got {weight!r}")
     return weights
+
+
+def measures_in(similarity: str | Mapping[str, float]) -> dict[str, Measure]:
+    """Return the rows of the measures that a setting ``similarity`` names; `InputError` as `similarity_weights`."""
+    return {name: MEASURES[name] for name in similarity_weights(similarity)}
+
+
+def needs_common_scale(similarity: str | Mapping[str, float]) -> bool:
+    """Return whether a measure compares intensities as they are, so that both images need one scale."""
+    return any(measure.common_scale for measure in measures_in(similarity).values())
 
 
 class Combination(Similarity):
@@ -67,16 +138,11 @@ class Combination(Similarity):
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         values, slope = [], torch.zeros_like(warped)
         for weight, channels, part in self.parts:
-            own = warped[:, channels]
-            value, derivative = part.evaluate(own, mask)
+            compared = warped[:, channels]
+            value, derivative = part.evaluate(compared, mask)
             values.append(weight * value)
-            slope[:, channels] += derivative * (weight * warped.shape[1] / own.shape[1])
+            slope[:, channels] += derivative * (weight * warped.shape[1] / compared.shape[1])
         return torch.stack(values).sum(0), slope
-
-
-def on_one_scale(similarity: str | Mapping[str, float]) -> bool:
-    """Return whether a measure compares intensities as they are, so that both images need one scale."""
-    return "ssd" in similarity_weights(similarity)
 
 
 def features(similarity: str | Mapping[str, float], image: Tensor) -> Tensor:
@@ -92,11 +158,8 @@ def features(similarity: str | Mapping[str, float], image: Tensor) -> Tensor:
     Raises:
         InputError: as `similarity_weights`, `mind_ssc`.
     """
-    weights = similarity_weights(similarity)
-    if "mind" not in weights:
-        return image
-    image = at_least_float32(image)
-    return mind_ssc(image) if len(weights) == 1 else torch.cat([image, mind_ssc(image)], dim=1)
+    parts = [kind.of(image) for kind in _kinds(similarity)]
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
 
 
 def make_similarity(
@@ -116,16 +179,25 @@ def make_similarity(
     Raises:
         InputError: as `similarity_weights`.
     """
-    weights, grid = similarity_weights(similarity), grid or Grid(tuple(fixed.shape[2:]))
-    if len(weights) == 1:
-        return _part(next(iter(weights)), fixed, window, grid)
-    channels = fixed.shape[1] // (1 + len(neighbour_pairs(grid.dim))) if "mind" in weights else fixed.shape[1]
-    parts = []
-    for name, weight in weights.items():
-        own = slice(channels, None) if name == "mind" else slice(0, channels)
-        parts.append((weight, own, _part(name, fixed[:, own], window, grid)))
-    return Combination(parts)
+    grid = grid or Grid(tuple(fixed.shape[2:]))
+    channels, parts = _channels(similarity, fixed.shape[1], grid.dim), []
+    for name, weight in similarity_weights(similarity).items():
+        measure = MEASURES[name]
+        compared = channels[measure.features]
+        part = measure.closed_form(fixed[:, compared], **measure.choose(window=window, grid=grid))
+        parts.append((weight, compared, part))
+    return parts[0][2] if len(parts) == 1 else Combination(parts)
 
 
-def _part(name: str, fixed: Tensor, window: int, grid: Grid) -> Similarity:
-    return MeanSquaredDifference(fixed) if name == "mind" else _OF_IMAGES[name](fixed, window, grid)
+def _kinds(similarity: str | Mapping[str, float]) -> list[Features]:
+    """Return the kinds of features in the order of their channels: intensities come first."""
+    kinds = dict.fromkeys(measure.features for measure in measures_in(similarity).values())
+    return sorted(kinds, key=lambda kind: kind is not INTENSITIES)
+
+
+def _channels(similarity: str | Mapping[str, float], total: int, dim: int) -> dict[Features, slice]:
+    """Return which of all channels each kind of features has."""
+    kinds = _kinds(similarity)
+    ends = [0, *accumulate(kind.count(dim) for kind in kinds)]
+    size = total // ends[-1]
+    return {kind: slice(size * a, size * b) for kind, (a, b) in zip(kinds, pairwise(ends), strict=True)}

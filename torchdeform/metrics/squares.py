@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from torchdeform.metrics.base import Similarity, at_least_float32, checked, mean, relative_weight, times
+from torchdeform.metrics.base import Similarity, at_least_float32, checked, mean, relative_weight, weighted
 from torchdeform.metrics.mind import mind_ssc
 
 
@@ -19,8 +19,8 @@ class MeanSquaredDifference(Similarity):
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         difference = self.fixed - at_least_float32(warped)
         weight = relative_weight(mask, difference)
-        weighted = times(difference, weight)
-        return -mean(weighted * difference), 2 * weighted
+        slope = weighted(difference, weight)
+        return -mean(slope * difference), 2 * slope
 
 
 def ssd(fixed: Tensor, warped: Tensor, *, mask: Tensor | None = None) -> Tensor:

@@ -12,7 +12,7 @@ from torchdeform.core.grid import Grid, per_item
 from torchdeform.core.resampling import prolong
 from torchdeform.core.warp import invert
 from torchdeform.errors import InputError
-from torchdeform.nn.heads import draw_back, flow_to_monitor, with_mean_one
+from torchdeform.nn.heads import flow_to_monitor, scale_to_bounds, with_mean_one
 from torchdeform.nn.precision import full_precision
 from torchdeform.nn.spatial import SpatialTransformer
 
@@ -152,8 +152,8 @@ class RandomDeformation(nn.Module):
         u = flow_to_monitor(f, self.curl * noise[:, 1:], grid, _STEPS)
         u = u * per_item((noise != 0).flatten(1).any(1), u)
         # Most of what must be drawn back is where that costs little; the second look rarely finds anything.
-        u = draw_back(u, grid, low**_MARGIN, high**_MARGIN, _MARGIN * self.curl)
-        return draw_back(prolong(u, self.grid), self.grid, low, high, self.curl)
+        u = scale_to_bounds(u, grid, low**_MARGIN, high**_MARGIN, _MARGIN * self.curl)
+        return scale_to_bounds(prolong(u, self.grid), self.grid, low, high, self.curl)
 
     def extra_repr(self) -> str:
         bounds = f"determinant={self.determinant}, curl={self.curl:g}, nodes={self.nodes}"

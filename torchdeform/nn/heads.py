@@ -1,16 +1,18 @@
 """The end of a network that answers with a map: features become a bounded monitor and curl, these a sound map."""
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torchdeform.core.derivatives import CURL_PAIRS
+from torchdeform.core.flow import OdeSolver, integrate_rate
 from torchdeform.core.grid import Grid, per_item
 from torchdeform.core.resampling import prolong
 from torchdeform.core.warp import warp
 from torchdeform.errors import InputError
-from torchdeform.nn.operators import div_curl_velocity, open_share
+from torchdeform.nn.operators import div_curl_velocity, share_within_bounds
 from torchdeform.nn.precision import full_precision
 
 _CONV = {2: nn.Conv2d, 3: nn.Conv3d}
@@ -102,7 +104,7 @@ class JacobianCurlHead(nn.Module):
     def deform(self, f: Tensor, curl: Tensor) -> Tensor:
         """Return u from the monitor and the curl that `fields` returns; arguments and result as there."""
         u = prolong(flow_to_monitor(f, curl, self._grid_of(f), self.steps), self.grid)
-        return draw_back(u, self.grid, self.least)
+        return scale_to_bounds(u, self.grid, self.least)
 
     def _grid_of(self, field: Tensor) -> Grid:
         shape = tuple(field.shape[2:])
@@ -115,20 +117,19 @@ class JacobianCurlHead(nn.Module):
         return f"shape={self.grid.shape}, spacing={self.grid.spacing}, {bounds}"
 
 
-def draw_back(u: Tensor, grid: Grid, least: float, most: float = math.inf, turn: float = math.inf) -> Tensor:
-    """Return t u with the share t ≤ 1 of each item, constant for the gradient, that keeps the bounds of `open_share`.
+def scale_to_bounds(
+    u: Tensor, grid: Grid, min_det: float, max_det: float = math.inf, max_curl: float = math.inf
+) -> Tensor:
+    """Return t u with the share t ≤ 1 of each item, constant for the gradient, that `share_within_bounds` finds.
 
     Args:
         u: displacement ``(B, D, *S)`` in units of spacing.
         grid: its grid.
-        least: smallest one-sided determinant allowed, below 1.
-        most: largest determinant of central differences allowed, above 1.
-        turn: largest component of the curl allowed.
+        min_det: smallest one-sided determinant allowed, below 1.
+        max_det: largest determinant of central differences allowed, above 1.
+        max_curl: largest component of the curl allowed.
     """
-    with torch.no_grad():
-        still, floor = torch.zeros_like(u), u.new_full((u.shape[0],), least)
-        share = open_share(still, u.detach(), floor, grid.spacing, most, turn)
-    return u * per_item(share, u)
+    return u * per_item(share_within_bounds(u.detach(), grid.spacing, min_det, max_det, max_curl), u)
 
 
 def with_mean_one(f: Tensor, grid: Grid) -> Tensor:
@@ -154,15 +155,10 @@ def flow_to_monitor(f: Tensor, curl: Tensor, grid: Grid, steps: int) -> Tensor:
         Differentiable once in f and curl.
     """
     v = div_curl_velocity(torch.cat([f - 1, curl], dim=1), grid.spacing, (1.0, 1.0, 0.0), "slip")
-    fields = torch.cat([v, f], dim=1)
+    fields, still = torch.cat([v, f], dim=1), torch.zeros_like(v)
 
-    def rate(t: float, u: Tensor | None) -> Tensor:
-        moved = fields if u is None else warp(fields, u, grid)
+    def rate(t: Any, u: Tensor) -> Tensor:
+        moved = fields if u is still else warp(fields, u, grid)
         return moved[:, :-1] / (moved[:, -1:] * (1 - t) + t)
 
-    step, u = 1 / steps, None
-    for k in range(steps):
-        half = rate(k * step, u) * (step / 2)
-        move = rate((k + 0.5) * step, half if u is None else u + half) * step
-        u = move if u is None else u + move
-    return move if u is None else u
+    return integrate_rate(rate, still, (0.0, 1.0), grid, OdeSolver(method="midpoint", steps=steps))[-1]

@@ -1,7 +1,5 @@
 """Losses: similarities, overlap of labels, and what a map may cost. All are scalars to be minimised."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor, nn
 
@@ -9,22 +7,10 @@ from torchdeform.core.derivatives import curl, divergence, jacobian_determinant
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import compose
 from torchdeform.errors import InputError, require_choice
-from torchdeform.metrics.correlation import lncc, ncc
-from torchdeform.metrics.gradients import ngf
-from torchdeform.metrics.information import mutual_information, normalised_mutual_information
-from torchdeform.metrics.squares import mind, ssd
+from torchdeform.metrics.similarity import MEASURES
 from torchdeform.nn.precision import full_precision
 
-# name -> the similarity S(fixed, warped, mask=...) -> (B,), higher is better.
-SIMILARITIES: dict[str, Callable[..., Tensor]] = {
-    "ssd": ssd,
-    "ncc": ncc,
-    "lncc": lncc,
-    "mi": mutual_information,
-    "nmi": normalised_mutual_information,
-    "ngf": ngf,
-    "mind": mind,
-}
+SIMILARITIES = {name: measure.function for name, measure in MEASURES.items()}
 
 # Determinants below this share the price 1/J of this one in `DeterminantLoss`, or it would be infinite.
 _SMALLEST = 1e-2
@@ -48,7 +34,7 @@ class SimilarityLoss(nn.Module):
 
     def __init__(self, name: str, **options: object) -> None:
         super().__init__()
-        require_choice(name, SIMILARITIES, "SimilarityLoss: name")
+        require_choice(name, MEASURES, "SimilarityLoss: name")
         self.name, self.options = name, options
 
     @full_precision
@@ -63,7 +49,7 @@ class SimilarityLoss(nn.Module):
         Raises:
             InputError: as the similarity.
         """
-        return -SIMILARITIES[self.name](fixed, warped, mask=mask, **self.options).mean()
+        return -MEASURES[self.name].function(fixed, warped, mask=mask, **self.options).mean()
 
     def extra_repr(self) -> str:
         return ", ".join([repr(self.name), *(f"{key}={value!r}" for key, value in self.options.items())])

@@ -11,34 +11,35 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchdeform.core.derivatives import curl, jacobian_determinant
+from torchdeform.core.derivatives import CURL_PAIRS, curl, jacobian_determinant
 from torchdeform.core.diagnostics import smallest_determinant
+from torchdeform.core.fold_free import largest_share
 from torchdeform.core.grid import Grid, per_item
-from torchdeform.fem.fast_transform import TransformSolver
-from torchdeform.fem.form import Form, div_curl_form
-from torchdeform.fem.operator import assemble_load
+from torchdeform.fem.solver import Method, solver_of
+from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
+from torchdeform.solvers.base import Factor
 
-# A map that must be drawn back is drawn back to a multiple of one part in 2 to this power.
+# A map that must be scaled down is scaled to a multiple of one part in 2 to this power.
 _HALVINGS = 7
 
 _local = threading.local()
 
 
-def _solver(
-    grid: Grid, weights: tuple[float, float, float], boundary: str, dtype: torch.dtype, device: torch.device
-) -> TransformSolver:
+def _factor(like: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str, solver: str) -> Factor:
     """Return the solver of this thread, since it has working memory; the last few are kept."""
     if not hasattr(_local, "make"):
-        _local.make = lru_cache(maxsize=16)(_make_solver)
-    return _local.make(grid, weights, boundary, dtype, device)
+        _local.make = lru_cache(maxsize=16)(_make_factor)
+    grid = _grid_of(like, spacing)
+    return _local.make(grid, tuple(weights), boundary, solver, like.dtype, like.device)
 
 
-def _make_solver(
-    grid: Grid, weights: tuple[float, float, float], boundary: str, dtype: torch.dtype, device: torch.device
-) -> TransformSolver:
+def _make_factor(
+    grid: Grid, weights: tuple[float, float, float], boundary: str, solver: Method, dtype: torch.dtype, device: str
+) -> Factor:
+    system = DivCurlSystem(grid, Weights(*weights), boundary)
     with torch.inference_mode(False):
-        return TransformSolver(grid, Weights(*weights), boundary, dtype=dtype, device=device)
+        return solver_of(solver, system).init(system, torch.empty(0, dtype=dtype, device=device))
 
 
 def _grid_of(field: Tensor, spacing: Sequence[float]) -> Grid:
@@ -46,43 +47,37 @@ def _grid_of(field: Tensor, spacing: Sequence[float]) -> Grid:
 
 
 @torch.library.custom_op("torchdeform::div_curl_velocity", mutates_args=())
-def div_curl_velocity(data: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str) -> Tensor:
+def div_curl_velocity(
+    data: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str, solver: str = "auto"
+) -> Tensor:
     """Return v = K⁻¹ A data: the velocity of divergence and curl ``data (B, 1 + C, *S)``, see `DivCurlVelocity`."""
-    grid, weights = _grid_of(data, spacing), _triple(weights)
-    load = assemble_load(_rows(grid.dim, weights), data, grid)
-    return _solver(grid, weights, boundary, data.dtype, data.device).solve(load)
+    system = DivCurlSystem(_grid_of(data, spacing), Weights(*weights), boundary)
+    return _factor(data, spacing, weights, boundary, solver)(system.load(div=data[:, :1], curl=data[:, 1:]))
 
 
 @torch.library.custom_op("torchdeform::div_curl_adjoint", mutates_args=())
-def div_curl_adjoint(slope: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str) -> Tensor:
+def div_curl_adjoint(
+    slope: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str, solver: str = "auto"
+) -> Tensor:
     """Return Aᵀ K⁻¹ slope, ``(B, 1 + C, *S)``: the transpose of `div_curl_velocity`, since K is symmetric."""
-    grid, weights = _grid_of(slope, spacing), _triple(weights)
-    form = _rows(grid.dim, weights)
-    solved = _solver(grid, weights, boundary, slope.dtype, slope.device).solve(slope)
-    with torch.enable_grad():
-        data = slope.new_zeros(slope.shape[0], len(form), *grid.shape).requires_grad_()
-        return torch.autograd.grad(assemble_load(form, data, grid), data, solved)[0]
-
-
-def _triple(weights: Sequence[float]) -> tuple[float, float, float]:
-    div, turn, zero = weights
-    return div, turn, zero
-
-
-def _rows(dim: int, weights: tuple[float, float, float]) -> Form:
-    """The rows of the form for the divergence and the curl, without those for the values of v."""
-    return div_curl_form(dim, Weights(weights[0], weights[1]))
+    solved = _factor(slope, spacing, weights, boundary, solver)(slope)
+    system = DivCurlSystem(_grid_of(slope, spacing), Weights(*weights), boundary)
+    found = []
+    for name, channels in (("div", 1), ("curl", len(CURL_PAIRS[system.grid.dim]))):
+        data = slope.new_zeros(slope.shape[0], channels, *slope.shape[2:]).requires_grad_()
+        with torch.enable_grad():
+            found += torch.autograd.grad(system.load(**{name: data}), data, solved)
+    return torch.cat(found, dim=1)
 
 
 @div_curl_velocity.register_fake
-def _(data: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str) -> Tensor:
+def _(data: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str, solver: str = "auto") -> Tensor:
     return data.new_empty(data.shape[0], data.dim() - 2, *data.shape[2:])
 
 
 @div_curl_adjoint.register_fake
-def _(slope: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str) -> Tensor:
-    dim = slope.dim() - 2
-    return slope.new_empty(slope.shape[0], 1 + dim * (dim - 1) // 2, *slope.shape[2:])
+def _(slope: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str, solver: str = "auto") -> Tensor:
+    return slope.new_empty(slope.shape[0], 1 + len(CURL_PAIRS[slope.dim() - 2]), *slope.shape[2:])
 
 
 def _remember(ctx, inputs, output) -> None:
@@ -91,56 +86,49 @@ def _remember(ctx, inputs, output) -> None:
 
 # Each is the derivative of the other, so derivatives of every degree are there.
 div_curl_velocity.register_autograd(
-    lambda ctx, slope: (div_curl_adjoint(slope, *ctx.settings), None, None, None), setup_context=_remember
+    lambda ctx, slope: (div_curl_adjoint(slope, *ctx.settings), None, None, None, None), setup_context=_remember
 )
 div_curl_adjoint.register_autograd(
-    lambda ctx, slope: (div_curl_velocity(slope, *ctx.settings), None, None, None), setup_context=_remember
+    lambda ctx, slope: (div_curl_velocity(slope, *ctx.settings), None, None, None, None), setup_context=_remember
 )
 
 
-@torch.library.custom_op("torchdeform::open_share", mutates_args=())
-def open_share(
-    start: Tensor, move: Tensor, least: Tensor, spacing: Sequence[float], most: float, turn: float
-) -> Tensor:
-    """Return for each item the share t ≤ 1 of a move that leaves φ = id + start + t · move within bounds, ``(B,)``.
+@torch.library.custom_op("torchdeform::share_within_bounds", mutates_args=())
+def share_within_bounds(u: Tensor, spacing: Sequence[float], min_det: float, max_det: float, max_curl: float) -> Tensor:
+    """Return for each item the share t ≤ 1 that leaves φ = id + t u within bounds, ``(B,)``.
 
     Args:
-        start: displacement ``(B, D, *S)`` in units of spacing, within the bounds itself.
-        move: what is added, the same shape.
-        least: smallest one-sided determinant allowed ``(B,)``.
+        u: displacement ``(B, D, *S)`` in units of spacing.
         spacing: of the grid.
-        most: largest determinant of central differences allowed.
-        turn: no component of the curl may be beyond ± this.
+        min_det: smallest one-sided determinant allowed, below 1.
+        max_det: largest determinant of central differences allowed, above 1.
+        max_curl: no component of the curl may be beyond ± this.
 
     Returns:
-        1 where all of the move will do, else a multiple of 1/128 found by bisection; 0 where none was found.
+        1 where all of u will do, else a multiple of 1/128 found by bisection; 0 where none was found.
 
     Notes:
-        Costs one look at the determinants, and seven more for the items that must be drawn back. Not differentiable:
+        Costs one look at the determinants, and eight more for the items that must be scaled down. Not differentiable:
         layers take t for a constant. NaN is never within bounds.
     """
-    grid = _grid_of(start, spacing)
-    share = torch.ones_like(start[:, 0].flatten(1)[:, 0])
-    index = (~_within(start + move, grid, least, most, turn)).nonzero().flatten()
-    start, move, least = start[index], move[index], least[index]
-    low = torch.zeros_like(least)
-    for k in range(1, _HALVINGS + 1 if len(index) else 0):
-        trial = low + 0.5**k
-        low = torch.where(_within(start + per_item(trial, move) * move, grid, least, most, turn), trial, low)
-    share[index] = low
+    grid = _grid_of(u, spacing)
+
+    def within(w: Tensor) -> Tensor:
+        good = smallest_determinant(w, grid) >= min_det
+        if max_det < math.inf:
+            good = good & (jacobian_determinant(w, grid).flatten(1).amax(1) <= max_det)
+        if max_curl < math.inf:
+            good = good & (curl(w, grid).abs().flatten(1).amax(1) <= max_curl)
+        return good
+
+    share, beyond = u.new_ones(u.shape[0]), ~within(u)
+    if bool(beyond.any()):
+        part = u[beyond]
+        accept = lambda t: within(per_item(t, part) * part)  # noqa: E731
+        share[beyond] = largest_share(accept, share[beyond], halvings=_HALVINGS, refine=True)
     return share
 
 
-def _within(u: Tensor, grid: Grid, least: Tensor, most: float, turn: float) -> Tensor:
-    """Return for each item whether the map keeps the bounds, ``(B,)``."""
-    good = smallest_determinant(u, grid) >= least
-    if most < math.inf:
-        good = good & (jacobian_determinant(u, grid).flatten(1).amax(1) <= most)
-    if turn < math.inf:
-        good = good & (curl(u, grid).abs().flatten(1).amax(1) <= turn)
-    return good
-
-
-@open_share.register_fake
-def _(start: Tensor, move: Tensor, least: Tensor, spacing: Sequence[float], most: float, turn: float) -> Tensor:
-    return start.new_empty(start.shape[0])
+@share_within_bounds.register_fake
+def _(u: Tensor, spacing: Sequence[float], min_det: float, max_det: float, max_curl: float) -> Tensor:
+    return u.new_empty(u.shape[0])

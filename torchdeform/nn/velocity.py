@@ -4,11 +4,12 @@ import torch
 from torch import Tensor, nn
 
 from torchdeform.core.derivatives import CURL_PAIRS
-from torchdeform.core.flow import ADAPTIVE, FIXED_STEP, OdeSolver, integrate
+from torchdeform.core.flow import OdeSolver, integrate
 from torchdeform.core.grid import Grid
-from torchdeform.core.warp import compose, keep_inside
 from torchdeform.errors import InputError, require_choice
-from torchdeform.fem.fast_transform import transform_is_exact
+from torchdeform.fem.fast_transform import is_exact_for
+from torchdeform.fem.solver import Method, SolverSettings
+from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
 from torchdeform.nn.operators import div_curl_velocity
 from torchdeform.nn.precision import full_precision
@@ -25,16 +26,17 @@ class DivCurlVelocity(nn.Module):
         weight_div: w_div > 0.
         weight_curl: w_curl > 0.
         weight_zero: w_zero ≥ 0 per squared unit of spacing; √(w_div / w_zero) is the length beyond which v decays.
+        solver: ``auto``, ``transform``, ``cg`` or ``assembled``, see `SolverSettings`.
 
     Raises:
-        InputError: an unknown boundary, weights out of range, or weights for which the transforms are not exact at
-            this boundary (``dirichlet`` with w_div ≠ w_curl: `solve_div_curl` solves these by conjugate gradients).
+        InputError: an unknown boundary or solver, weights out of range, or ``transform`` where it is not exact.
 
     Notes:
-        A direct solve by fast transforms, one node for torch.compile and torch.export. Its gradient is one more solve
-        with the transposed operator; nothing is kept for it, and derivatives of every degree are there. Exact to
-        rounding, so there is no tolerance. Factors are computed once for each dtype, device and thread. Always float32
-        or float64, also within autocast. Liu, Liao & Xue 2007, eq. (3.1) and (3.5).
+        ``auto`` is a direct solve by fast transforms where they are exact (not for ``dirichlet`` with w_div ≠ w_curl),
+        else conjugate gradients; either is one node for torch.compile and torch.export. Its gradient is one more solve
+        with the transposed operator; nothing is kept for it, and derivatives of every degree are there. Solvers are
+        made ready once for each dtype, device and thread. Always float32 or float64, also within autocast.
+        Liu, Liao & Xue 2007, eq. (3.1) and (3.5).
     """
 
     def __init__(
@@ -45,16 +47,17 @@ class DivCurlVelocity(nn.Module):
         weight_div: float = 1.0,
         weight_curl: float = 1.0,
         weight_zero: float = 0.0,
+        solver: Method = "auto",
     ) -> None:
         super().__init__()
         require_choice(boundary, _BOUNDARIES, "DivCurlVelocity: boundary")
-        weights = Weights(weight_div, weight_curl, weight_zero)
-        if not transform_is_exact(grid, weights, boundary):
+        system = DivCurlSystem(grid, Weights(weight_div, weight_curl, weight_zero), boundary)
+        if SolverSettings(method=solver).method == "transform" and not is_exact_for(system):
             raise InputError(
                 f"DivCurlVelocity: the transforms are not exact for {boundary} with these weights; make weight_div and "
-                "weight_curl equal, or use solve_div_curl"
+                "weight_curl equal, or take solver='auto'"
             )
-        self.grid, self.boundary = grid, boundary
+        self.grid, self.boundary, self.solver = grid, boundary, solver
         self.weights = (float(weight_div), float(weight_curl), float(weight_zero))
 
     @full_precision
@@ -76,12 +79,13 @@ class DivCurlVelocity(nn.Module):
         if curl is not None:
             self.grid.check(curl, "DivCurlVelocity: curl", components=len(CURL_PAIRS[self.grid.dim]))
         data = div if curl is None else torch.cat([div, curl], dim=1)
-        return div_curl_velocity(_whole(data, self.grid), self.grid.spacing, self.weights, self.boundary)
+        return div_curl_velocity(_whole(data, self.grid), self.grid.spacing, self.weights, self.boundary, self.solver)
 
     def extra_repr(self) -> str:
         names = ("weight_div", "weight_curl", "weight_zero")
         weights = ", ".join(f"{n}={w:g}" for n, w in zip(names, self.weights, strict=True))
-        return f"shape={self.grid.shape}, spacing={self.grid.spacing}, boundary={self.boundary!r}, {weights}"
+        chosen = f"boundary={self.boundary!r}, {weights}, solver={self.solver!r}"
+        return f"shape={self.grid.shape}, spacing={self.grid.spacing}, {chosen}"
 
 
 def _whole(data: Tensor, grid: Grid) -> Tensor:
@@ -97,7 +101,7 @@ class FlowIntegrator(nn.Module):
 
     Args:
         grid: the grid.
-        method: ``squaring`` (v/2ⁿ composed with itself n times), or a method of torchdiffeq: ``euler``, ``midpoint``,
+        method: ``squaring`` (v/2ⁿ composed with itself n times), or one that torchdiffeq runs: ``euler``, ``midpoint``,
             ``rk4``, ``dopri5``, see `OdeSolver`.
         steps: n for ``squaring``, else the steps of equal length.
         adjoint: for the methods of torchdiffeq, take gradients from the adjoint equation.
@@ -110,15 +114,13 @@ class FlowIntegrator(nn.Module):
         2·D per node and stage (``rk4`` has 4 stages a step). With ``adjoint`` 5·D are kept however many steps there
         are: the flow is followed backwards in time, which takes about as long again, and the gradient has the error of
         the method.
-        torch.compile and torch.export take ``squaring`` in one graph; torchdiffeq breaks it.
+        torch.compile and torch.export take all but ``dopri5`` and ``adjoint`` in one graph: traced, the methods of
+        fixed steps run without torchdiffeq, to the same numbers but for rounding.
     """
 
     def __init__(self, grid: Grid, method: str = "squaring", *, steps: int = 7, adjoint: bool = False) -> None:
         super().__init__()
-        require_choice(method, ("squaring", *FIXED_STEP, *ADAPTIVE), "FlowIntegrator: method")
-        OdeSolver(steps=steps)
-        if adjoint and method == "squaring":
-            raise InputError("FlowIntegrator: squaring has no adjoint equation; take method='rk4'")
+        OdeSolver(method=method, steps=steps, adjoint=adjoint)
         self.grid, self.method, self.steps, self.adjoint = grid, method, steps, adjoint
 
     @full_precision
@@ -135,8 +137,6 @@ class FlowIntegrator(nn.Module):
             InputError: shape.
             ComputationError: ``dopri5`` found no step.
         """
-        if self.method == "squaring":
-            return square(v, self.grid, self.steps)
         return integrate(v, self.grid, self.steps, self.method, adjoint=self.adjoint)
 
     def inverse(self, v: Tensor) -> Tensor:
@@ -146,26 +146,3 @@ class FlowIntegrator(nn.Module):
     def extra_repr(self) -> str:
         how = f"method={self.method!r}, steps={self.steps}, adjoint={self.adjoint}"
         return f"shape={self.grid.shape}, spacing={self.grid.spacing}, {how}"
-
-
-def square(v: Tensor, grid: Grid, steps: int = 7) -> Tensor:
-    """Return the displacement of the flow of v by scaling and squaring: φ ← φ ∘ φ, ``steps`` times, from id + v/2ⁿ.
-
-    Args:
-        v: velocity ``(B, D, *S)`` in units of spacing per unit of time.
-        grid: its grid.
-        steps: n.
-
-    Returns:
-        u ``(B, D, *S)`` in units of spacing.
-
-    Raises:
-        InputError: shape.
-
-    Notes:
-        Error O(2⁻ⁿ) and that of n linear interpolations. Costs n samplings. Differentiable.
-    """
-    u = v / 2**steps
-    for _ in range(steps):
-        u = compose(u, u, grid)
-    return keep_inside(u, grid)

@@ -4,18 +4,11 @@ import re
 from pathlib import Path
 
 from torchdeform import __version__
-from torchdeform.metrics.similarity import similarity_weights
+from torchdeform.pipeline.memory import choices
 from torchdeform.registration.settings import RegistrationSettings
 
 # What every registration uses, and what some settings add; the keys are those of references.bib.
 _ALWAYS = {"torchdeform": "the software", "liu2007reconstruction": "the method", "liu2024finite": "what a fold is"}
-_SIMILARITIES = {
-    "lncc": ("avants2008symmetric",),
-    "mi": ("viola1997alignment", "thevenaz2000optimization"),
-    "nmi": ("studholme1999overlap",),
-    "ngf": ("haber2006intensity",),
-    "mind": ("heinrich2013towards",),
-}
 _DISCRETE = ("steinbruecker2009large", "siebert2021fast", "heinrich2013towards")
 
 
@@ -28,10 +21,10 @@ def citations(settings: RegistrationSettings) -> dict[str, str]:
     Notes:
         Measures that are common property (``ssd``, ``ncc``) have no entry.
     """
-    found = dict(_ALWAYS)
-    for name in similarity_weights(settings.similarity):
-        found |= dict.fromkeys(_SIMILARITIES.get(name, ()), f"similarity: {name}")
-    if settings.start == "discrete":
+    found, (measures, discrete, _) = dict(_ALWAYS), choices(settings)
+    for name, measure in measures.items():
+        found |= dict.fromkeys(measure.references, f"similarity: {name}")
+    if discrete:
         found |= {key: f"{found[key]}, start: discrete" if key in found else "start: discrete" for key in _DISCRETE}
     return found
 

@@ -1,13 +1,14 @@
 """Settings from presets, YAML files and ``key=value`` overrides: typed, and no key unknown."""
 
 import os
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, get_type_hints
 
 from torchdeform.errors import InputError, nearest_name, require_choice
-from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.settings import SHORT_FORMS, RegistrationSettings
 
 _PRESETS = "presets"
 _MOST_ENTRIES = 300_000  # of a YAML file, those that aliases repeat counted again
@@ -25,8 +26,9 @@ def load_settings(
 
     Args:
         preset: one of `preset_names`.
-        file: YAML file with some of the fields of `RegistrationSettings`.
-        overrides: values by field name; ``"a.b"`` names field ``b`` of field ``a``.
+        file: YAML file with some of the settings of `RegistrationSettings`.
+        overrides: values by name; ``"a.b"`` names setting ``b`` of group ``a``, and a group that has a short form
+            may be given by it: ``{"solver": "cg"}`` is ``{"solver.method": "cg"}``.
 
     Returns:
         The settings, typed and checked.
@@ -39,12 +41,15 @@ def load_settings(
     layers = [(f"preset {preset}", read_yaml(configs_folder() / _PRESETS / f"{preset}.yaml"))]
     if file is not None:
         layers.append((str(file), read_yaml(Path(file))))
-    layers.append(("settings", _nested(overrides or {})))
+    layers.append(("settings", dict(overrides or {})))
     merged: dict[str, Any] = {}
+    sources: dict[str, str] = {}
     for where, layer in layers:
-        _require_known(RegistrationSettings, layer, where)
-        _merge(merged, layer)
-    return _validate(merged, {key: where for where, layer in layers for key in layer})
+        values = nested(layer)
+        _require_known(RegistrationSettings, values, where)
+        _merge(RegistrationSettings, merged, values)
+        sources |= dict.fromkeys(_leaves(values), where)
+    return _validate(merged, sources)
 
 
 def preset_names() -> list[str]:
@@ -175,36 +180,90 @@ def _unique_keys_loader(base: Any) -> type:
     return Loader
 
 
-def _nested(flat: Mapping[str, object]) -> dict[str, Any]:
-    """Return ``{"a.b": 1}`` as ``{"a": {"b": 1}}``."""
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings by group: ``{"a.b": 1}`` as ``{"a": {"b": 1}}``, and ``solver: cg`` as ``{method: cg}``."""
     tree: dict[str, Any] = {}
-    for key, value in flat.items():
+    for key, value in values.items():
         *parents, name = key.split(".")
-        node: dict[str, Any] = {name: value}
+        node = {name: value if parents else _whole_group(name, value)}
         for parent in reversed(parents):
             node = {parent: node}
-        _merge(tree, node)
+        _merge(RegistrationSettings, tree, node)
     return tree
 
 
-def _merge(base: dict[str, Any], change: Mapping[str, Any]) -> None:
-    """Lay ``change`` over ``base``, mapping by mapping."""
+def merged_settings(*layers: Mapping[str, Any]) -> dict[str, Any]:
+    """Return several mappings of settings as one, the later ones laid over the earlier."""
+    tree: dict[str, Any] = {}
+    for layer in layers:
+        _merge(RegistrationSettings, tree, nested(layer))
+    return tree
+
+
+def _whole_group(name: str, value: object) -> object:
+    """Return the mapping that the short form of a group stands for; weights of measures are one, too."""
+    if name not in SHORT_FORMS:
+        return value
+    known = {field.name for field in fields(get_type_hints(RegistrationSettings)[name])}
+    weights = (
+        isinstance(value, Mapping)
+        and not known & value.keys()
+        and all(isinstance(weight, int | float) for weight in value.values())
+    )
+    return {SHORT_FORMS[name]: value} if weights or not isinstance(value, Mapping) else value
+
+
+def _merge(kind: Any, base: dict[str, Any], change: Mapping[str, Any]) -> None:
+    """Lay ``change`` over ``base``, group by group of the dataclass ``kind``."""
+    hints = get_type_hints(kind)
     for key, value in change.items():
-        if isinstance(value, dict) and isinstance(base.get(key), dict):
-            _merge(base[key], value)
+        if isinstance(value, dict) and isinstance(base.get(key), dict) and is_dataclass(hints.get(key)):
+            _merge(hints[key], base[key], value)
         else:
-            base[key] = value
+            base[key] = dict(value) if isinstance(value, dict) else value
 
 
-def _require_known(kind: type, values: Mapping[str, Any], where: str, prefix: str = "") -> None:
+def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Yield the dotted names of settings."""
+    for key, value in values.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+
+
+def setting_names(kind: Any = RegistrationSettings, prefix: str = "") -> list[str]:
+    """Return the dotted names of all settings, groups left out."""
+    names = []
+    for name, hint in ((field.name, get_type_hints(kind)[field.name]) for field in fields(kind)):
+        names += setting_names(hint, f"{prefix}{name}.") if is_dataclass(hint) else [f"{prefix}{name}"]
+    return names
+
+
+def _require_known(kind: Any, values: Mapping[str, Any], where: str, prefix: str = "") -> None:
     """Raise `InputError` for the first key that is no field of the dataclass ``kind``, or of one inside it."""
     hints = get_type_hints(kind)
     known = [field.name for field in fields(kind)]
     for key, value in values.items():
         if key not in known:
-            raise InputError(f"{where}: there is no setting '{prefix}{key}'{nearest_name(key, known)}")
-        if is_dataclass(hints[key]) and isinstance(value, dict):
-            _require_known(hints[key], value, where, f"{prefix}{key}.")
+            raise InputError(f"{where}: there is no setting '{prefix}{key}'{_suggestion(key, known, prefix)}")
+        if not is_dataclass(hints[key]):
+            continue
+        if not isinstance(value, dict):
+            inside = ", ".join(field.name for field in fields(hints[key]))
+            raise InputError(f"{where}: {prefix}{key} is a group of settings ({inside}), got {value!r}")
+        _require_known(hints[key], value, where, f"{prefix}{key}.")
+
+
+def _suggestion(key: str, known: Sequence[str], prefix: str) -> str:
+    """Return what may have been meant: the same name in another group, else the nearest name here or anywhere."""
+    by_last = {name.rpartition(".")[2]: name for name in setting_names()}  # of several, the later group
+    if key in by_last:
+        return f"; did you mean '{by_last[key]}'?"
+    near = nearest_name(key, known)
+    if near:
+        return near.replace("mean '", f"mean '{prefix}")
+    other = [last for last in by_last if last.startswith(key)] or get_close_matches(key, by_last, n=1, cutoff=0.6)
+    return f"; did you mean '{by_last[other[0]]}'?" if other else ""
 
 
 def _validate(values: dict[str, Any], sources: Mapping[str, str]) -> RegistrationSettings:
@@ -219,4 +278,7 @@ def _validate(values: dict[str, Any], sources: Mapping[str, str]) -> Registratio
     if not first["loc"]:
         raise InputError(f"settings: {problem}")
     name = ".".join(map(str, first["loc"]))
-    raise InputError(f"{sources[str(first['loc'][0])]}: {name} = {first['input']!r}: {problem}")
+    inside = [known for known in sources if known.startswith(f"{name}.") and known.rpartition(".")[2] in problem]
+    where = next((sources[known] for known in (*inside, name, name.partition(".")[0]) if known in sources), "settings")
+    given = "" if isinstance(first["input"], dict) else f"{name} = {first['input']!r}: "
+    raise InputError(f"{where}: {given}{problem}")

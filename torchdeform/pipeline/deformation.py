@@ -1,4 +1,4 @@
-"""Grids, reconstructions and simulated volume changes of files, from reading to the folder of results."""
+"""The deformation method from file to folder: adapted grids, reconstructions, simulated changes of volume."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -27,10 +27,11 @@ from torchdeform.deformation.versions import grid_from_target_monitor
 from torchdeform.deformation.volumes import simulate_volume_change
 from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.io import read_displacement, read_image, write_displacement, write_image, write_transform
-from torchdeform.io.files import require_writable, staged
-from torchdeform.io.images import ending_like
+from torchdeform.io.files import atomic_folder, require_writable
+from torchdeform.io.images import ending_like, read_optional
 from torchdeform.report.grids import write_grids
 from torchdeform.report.record import versions, write_json
+from torchdeform.report.report_data import grey, to_unit
 from torchdeform.solvers.base import Status
 
 MonitorName = Literal["gradient", "curvature", "density", "value"]
@@ -43,16 +44,16 @@ class GridSettings:
     """How a grid is adapted to an image.
 
     Args:
-        monitor: what asks for small cells: ``gradient`` (edges), ``curvature`` (bends), ``density`` (bright places), or
-            ``value``, for an image that holds the monitor f itself.
+        monitor: where cells are small: ``gradient`` (edges), ``curvature`` (bends), ``density`` (bright regions), or
+            ``value`` for an image that is the monitor f itself.
         f_min: size of the smallest cells, positive.
         f_max: size of the largest cells; only the ratio of the two matters.
         smoothing: standard deviation of the Gaussian that smooths image or monitor, units of spacing; twice the largest
             spacing when None.
-        velocity: way to the velocity, see `find_velocity`.
+        velocity: how the velocity is found, see `find_velocity`.
 
     Raises:
-        InputError: a name or number that will not do.
+        InputError: an unknown name, or a number out of range.
     """
 
     monitor: MonitorName = "gradient"
@@ -77,15 +78,15 @@ class GridSettings:
 
 
 def adapt_grid_to_file(image: Path, out: Path, settings: GridSettings, device: torch.device) -> Record:
-    """Adapt a grid to an image file: J(φ) = f(φ), f being small where cells shall be small (Version 2).
+    """Adapt a grid to an image file: J(φ) = f(φ), where a small f makes small cells (Version 2).
 
     Writes ``displacement.nii.gz`` (u of φ = id + u), ``monitor.nii.gz`` (f, with mean of 1/f one), ``grid.png`` and
     ``result.json`` into ``out``, all or none.
 
     Args:
         image: the image.
-        out: folder for the results; made if need be.
-        settings: which monitor.
+        out: folder for the results; created if missing.
+        settings: monitor and velocity.
         device: where to compute.
 
     Returns:
@@ -93,7 +94,7 @@ def adapt_grid_to_file(image: Path, out: Path, settings: GridSettings, device: t
 
     Raises:
         InputError: the file, the folder, or a monitor that is not positive.
-        ComputationError: the grid could not be made.
+        ComputationError: no grid was found.
     """
     require_writable(out)
     picture = read_image(image)
@@ -109,10 +110,10 @@ def adapt_grid_to_file(image: Path, out: Path, settings: GridSettings, device: t
         "determinant_error_mean": error.mean().item(),
         "determinant_error_max": error.max().item(),
     }
-    with staged(out) as folder:
+    with atomic_folder(out) as folder:
         write_displacement(u.cpu(), picture, folder / "displacement.nii.gz")
         write_image(replace(picture, data=f.cpu(), pixel_type="float32"), folder / "monitor.nii.gz")
-        write_grids(folder / "grid.png", {"adapted grid": points.cpu()}, _grey(picture))
+        write_grids(folder / "grid.png", {"adapted grid": points.cpu()}, _background(picture))
         write_json(record, folder / "result.json")
     return record
 
@@ -120,16 +121,16 @@ def adapt_grid_to_file(image: Path, out: Path, settings: GridSettings, device: t
 def reconstruct_file(
     displacement: Path, out: Path, order: int, refine: bool, steps: int | None, device: torch.device
 ) -> Record:
-    """Take a displacement file apart into divergence, curl and boundary values, and reconstruct the map from them.
+    """Compute divergence, curl and boundary values of a displacement file, and reconstruct the map from them.
 
-    Writes ``displacement.nii.gz``, ``step_01.nii.gz`` and so on where ``steps`` are asked for, ``grids.png`` and
+    Writes ``displacement.nii.gz``, with ``steps`` also ``step_01.nii.gz`` and so on, ``grids.png`` and
     ``result.json`` into ``out``, all or none.
 
     Args:
         displacement: an ITK displacement field.
-        out: folder for the results; made if need be.
+        out: folder for the results; created if missing.
         order: order of the finite differences, 2 or 4.
-        refine: correct by what the finite differences of the result still miss.
+        refine: correct the map until the finite differences of the result agree with those given.
         steps: time steps from the identity to the map; none when None.
         device: where to compute.
 
@@ -146,7 +147,7 @@ def reconstruct_file(
     data = divergence(u, grid, order), curl(u, grid, order)
     solution = reconstruct(*data, grid, u, order=order, refine=refine, steps=steps)
     if solution.status[0] not in (Status.CONVERGED, Status.ROUNDING):
-        raise ComputationError(f"{displacement}: the reconstruction stopped short: {solution.status[0].value}")
+        raise ComputationError(f"{displacement}: the reconstruction did not converge: {solution.status[0].value}")
     distance = (solution.value - u).norm(dim=1)
     record = _described(displacement, solution.value, grid) | {
         "settings": {"order": order, "refine": refine, "steps": steps},
@@ -155,51 +156,51 @@ def reconstruct_file(
         "distance_max_voxels": voxels(solution.value - u, grid).max().item(),
         "misfit": solution.misfit.item(),
     }
-    shots = [] if solution.trajectory is None else list(solution.trajectory.cpu())
-    with staged(out) as folder:
+    trajectory = [] if solution.trajectory is None else list(solution.trajectory.cpu())
+    with atomic_folder(out) as folder:
         write_displacement(solution.value.cpu(), given, folder / "displacement.nii.gz")
-        for step, shot in enumerate(shots, start=1):
-            write_displacement(shot, given, folder / f"step_{step:0{len(str(len(shots)))}}.nii.gz")
-        write_grids(folder / "grids.png", _figure_1(u.cpu(), solution.value.cpu(), shots, grid))
+        for step, moved in enumerate(trajectory, start=1):
+            write_displacement(moved, given, folder / f"step_{step:0{len(str(len(trajectory)))}}.nii.gz")
+        write_grids(folder / "grids.png", _reconstruction_grids(u.cpu(), solution.value.cpu(), trajectory, grid))
         write_json(record, folder / "result.json")
     return record
 
 
-def _figure_1(given: Tensor, value: Tensor, shots: list[Tensor], grid: Grid) -> dict[str, Tensor]:
-    """Return the grids to draw: given, the middle time step where there are any, and the last."""
-    nodes, middle = grid.points(dtype=given.dtype), len(shots) // 2
-    between = {f"time step {middle}": nodes + shots[middle - 1]} if middle else {}
-    last = f"time step {len(shots)}" if shots else "reconstructed"
+def _reconstruction_grids(given: Tensor, value: Tensor, trajectory: list[Tensor], grid: Grid) -> dict[str, Tensor]:
+    """Return the grids to draw: the given one, the middle time step if there are steps, and the last."""
+    nodes, middle = grid.points(dtype=given.dtype), len(trajectory) // 2
+    between = {f"time step {middle}": nodes + trajectory[middle - 1]} if middle else {}
+    last = f"time step {len(trajectory)}" if trajectory else "reconstructed"
     return {"given": nodes + given} | between | {last: nodes + value}
 
 
 def simulate_file(
     image: Path, labels: Path, factors: Mapping[int, float], out: Path, rigid: Path | None, smoothing: float | None
 ) -> Record:
-    """Change the volumes of labelled regions of an image file by their factors.
+    """Change the volumes of labelled regions of an image file by given factors.
 
     Writes ``simulated.*`` and ``labels.*`` (image and labels after the change), ``displacement.nii.gz`` and
-    ``transform.h5`` (points after the change -> points before, which pulls the image back), ``inverse.h5`` (before ->
+    ``transform.h5`` (points after the change -> points before, as a resampler needs it), ``inverse.h5`` (before ->
     after), ``grid.png`` and ``result.json`` into ``out``, all or none.
 
     Args:
         image: the image.
         labels: its labels, on the same grid.
         factors: new volume over old volume by label.
-        out: folder for the results; made if need be.
-        rigid: mask of what must not move, not zero there, on the same grid.
+        out: folder for the results; created if missing.
+        rigid: mask of what must not move (not 0 there), on the same grid.
         smoothing: standard deviation of the Gaussian that smooths borders, units of spacing; the spacing when None.
 
     Returns:
         What ``result.json`` holds.
 
     Raises:
-        InputError: the files, places that differ, labels or factors.
-        ComputationError: the volumes could not be reached, or the map folds next to what is rigid.
+        InputError: the files, positions that differ, labels or factors.
+        ComputationError: the volumes could not be reached, or the map folds beside the rigid region.
     """
     require_writable(out)
     picture, regions = read_image(image), read_image(labels)
-    mask = None if rigid is None else read_image(rigid)
+    mask = read_optional(rigid)
     for other in (regions, mask):
         if other is not None:
             require_same_place(other, picture)
@@ -207,9 +208,8 @@ def simulate_file(
     where = None if mask is None else mask.data != 0
     change = simulate_volume_change(values, factors, grid, rigid_mask=where, smoothing=smoothing)
     if change.status[0] is not Status.CONVERGED:
-        raise ComputationError(
-            f"{labels}: the volumes came within {change.residual.item():.2%} only; ask for less, or lower --smoothing"
-        )
+        off = f"the volumes differ by {change.residual.item():.2%} from those asked for"
+        raise ComputationError(f"{labels}: {off}; ask for less, or lower --smoothing")
     u, back = change.value, invert(change.value, grid)
     record = _described(image, u, grid) | {
         "labels": str(labels),
@@ -220,35 +220,31 @@ def simulate_file(
     }
     changed = replace(picture, data=resample(picture, picture, back, outside=None).to(picture.data.dtype))
     moved = replace(regions, data=resample(regions, regions, back, mode="nearest", outside=None).to(values.dtype))
-    with staged(out) as folder:
+    with atomic_folder(out) as folder:
         write_image(changed, folder / f"simulated{ending_like(image, changed)}")
         write_image(moved, folder / f"labels{ending_like(labels, moved)}")
         write_displacement(back, picture, folder / "displacement.nii.gz")
         write_transform(back, picture, folder / "transform.h5")
         write_transform(u, picture, folder / "inverse.h5")
-        write_grids(folder / "grid.png", {"moved grid": grid.points(dtype=u.dtype) + u}, _grey(changed))
+        write_grids(folder / "grid.png", {"moved grid": grid.points(dtype=u.dtype) + u}, _background(changed))
         write_json(record, folder / "result.json")
     return record
 
 
 def _whole(regions: Image) -> Tensor:
-    """Return label values ``(1, 1, *S)``, refused unless they are whole numbers in one channel."""
+    """Return label values ``(1, 1, *S)``; `InputError` unless they are whole numbers in one channel."""
     if regions.data.shape[1] != 1 or not bool((regions.data == regions.data.round()).all()):
-        raise InputError(f"{regions.name} is no label image; give one channel of whole numbers")
+        raise InputError(f"{regions.name} is no label image; give an image of whole numbers with one channel")
     return regions.data
 
 
-def _grey(image: Image) -> Tensor | None:
+def _background(image: Image) -> Tensor | None:
     """Return a 2D image as grey values from 0 to 1; None in 3D."""
-    if image.grid.dim != 2:
-        return None
-    grey = luminance(image).data
-    low, high = grey.min(), grey.max()
-    return (grey - low) / (high - low).clamp(min=1e-12)
+    return to_unit(grey(image), grey(image)) if image.grid.dim == 2 else None
 
 
 def _described(source: Path, u: Tensor, grid: Grid) -> Record:
-    """Return what all records have in common."""
+    """Return what the records of all three commands have in common."""
     diagnosis = diagnose(u, grid)
     return {
         "source": str(source),

@@ -3,16 +3,15 @@
 import math
 import re
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import MIN_NODES, with_voxels
-from torchdeform.errors import InputError, require_choice
-from torchdeform.metrics.similarity import similarity_weights
-from torchdeform.registration.settings import STARTS
+from torchdeform.errors import InputError
+from torchdeform.metrics.similarity import Measure, measures_in
+from torchdeform.registration.settings import RegistrationSettings
 
 _UNITS = {"": 1, "k": 1e3, "m": 1e6, "g": 1e9, "t": 1e12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
 _SIZE = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([kmgt]i?)?b?\s*", re.IGNORECASE)
@@ -24,50 +23,42 @@ _SHRINK = 0.97  # steps in which the grid that fits is sought, per axis
 _PROCESS = Path("/proc/self/cgroup")
 _GROUPS = Path("/sys/fs/cgroup")
 _MEMINFO = Path("/proc/meminfo")
+_STATUS = Path("/proc/self/status")
 # Limit and use of a control group, by its version's file names.
 _LIMITS = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
 
 
-# Measured by ``scripts/benchmarks/memory.py``: bytes of a process that has imported everything; per node of the fixed
-# grid, whatever the similarity; and per node and channel of the images, by similarity. By dimension.
+# Measured by ``scripts/benchmarks/memory.py``: bytes of a process that has imported everything; and per node of the
+# fixed grid, whatever the similarity, by dimension. To these come those of `Measure.memory` per node and channel.
 _PROCESS_BYTES = 4.5e8
 _PER_NODE = {2: 100.0, 3: 80.0}
-_PER_CHANNEL = {
-    "ssd": {2: 60.0, 3: 55.0},
-    "ncc": {2: 60.0, 3: 55.0},
-    "lncc": {2: 45.0, 3: 40.0},
-    "mi": {2: 60.0, 3: 50.0},
-    "nmi": {2: 60.0, 3: 50.0},
-    "ngf": {2: 75.0, 3: 60.0},
-    "mind": {2: 140.0, 3: 300.0},
-}
 # The same of a discrete start, whatever the similarity: per node, and per node and channel. What holds more counts.
 _DISCRETE = {2: (130.0, 75.0), 3: (100.0, 65.0)}
 # And of reading, joining, judging and writing on the fixed grid, however coarse the finest level is.
 _FILES = {2: (65.0, 48.0), 3: (80.0, 26.0)}
 
 
-def estimate(
-    grid: Grid, *, channels: int = 1, similarity: str | Mapping[str, float] = "lncc", start: str = "identity"
-) -> int:
+def choices(settings: RegistrationSettings) -> tuple[dict[str, Measure], bool, bool]:
+    """Return what the cost of a registration depends on: its measures, a discrete start or not, symmetric or not."""
+    return measures_in(settings.similarity.measure), settings.start == "discrete", settings.symmetric
+
+
+def footprint(grid: Grid, channels: int, settings: RegistrationSettings) -> int:
     """Return about how many bytes a process holds at most that registers images on this grid, from files to files.
 
     Args:
         grid: of the fixed image, which the finest level has.
         channels: of the images.
-        similarity: one or several, as in `RegistrationSettings`.
-        start: ``identity`` or ``discrete``, likewise.
-
-    Raises:
-        InputError: an unknown similarity or start.
+        settings: of the registration.
 
     Notes:
         Affine in the number of nodes; coarser levels are smaller by 2^D and do not count. Measured in float32 on a CPU,
         within 25 % from 64³ to 256³ and from 512² to 4096², and rather more than is taken beyond.
     """
-    require_choice(start, STARTS, "start")
-    per_channel = sum(_PER_CHANNEL[name][grid.dim] for name in similarity_weights(similarity))
-    rates = [(_PER_NODE[grid.dim], per_channel), *([_DISCRETE[grid.dim]] if start == "discrete" else [])]
+    measures, discrete, symmetric = choices(settings)
+    maps = 2 if symmetric else 1
+    per_channel = sum(measure.memory[grid.dim - 2] for measure in measures.values())
+    rates = [(maps * _PER_NODE[grid.dim], maps * per_channel), *([_DISCRETE[grid.dim]] if discrete else [])]
     return max(_affine(grid, channels, rate) for rate in rates)
 
 
@@ -86,12 +77,14 @@ def available(device: torch.device | str = "cpu") -> int | None:
     """
     if torch.device(device).type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
-    known = [room for room in (_free(), *_group_rooms()) if room is not None]
+    known = [room for room in (_kilobytes("MemAvailable", _MEMINFO), *_group_rooms()) if room is not None]
     return max(0, min(known)) if known else None
 
 
 def peak() -> int | None:
     """Return the most bytes of memory that this process has held so far, None if that cannot be known."""
+    if (found := _kilobytes("VmHWM", _STATUS)) is not None:  # getrusage counts the parent's until the process has more
+        return found
     try:
         import resource
     except ImportError:  # not on Windows
@@ -99,9 +92,9 @@ def peak() -> int | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _PEAK_UNIT
 
 
-def _free() -> int | None:
-    """Return MemAvailable of the machine."""
-    found = re.search(r"MemAvailable:\s*(\d+) kB", _text(_MEMINFO))
+def _kilobytes(name: str, path: Path) -> int | None:
+    """Return the bytes of a line ``name: .. kB`` in a file of the kernel, None if there is none."""
+    found = re.search(rf"^{name}:\s*(\d+) kB", _text(path), re.MULTILINE)
     return int(found[1]) * 1024 if found else None
 
 
@@ -150,22 +143,14 @@ def readable(size: int, *, spaced: bool = True) -> str:
     return f"{size / 1000**exponent:.3g}{' ' if spaced else ''}{('B', 'kB', 'MB', 'GB', 'TB')[exponent]}"
 
 
-def fitting_grid(
-    grid: Grid,
-    limit: int,
-    *,
-    channels: int = 1,
-    similarity: str | Mapping[str, float] = "lncc",
-    start: str = "identity",
-) -> Grid:
+def fitting_grid(grid: Grid, limit: int, channels: int, settings: RegistrationSettings) -> Grid:
     """Return the finest grid of the same box on which a registration takes at most ``limit`` bytes.
 
     Args:
         grid: of the fixed image; returned as it is if it fits.
         limit: bytes, see `parse_size`.
         channels: of the images.
-        similarity: one or several, as in `RegistrationSettings`.
-        start: ``identity`` or ``discrete``, likewise.
+        settings: of the registration.
 
     Raises:
         InputError: files of this size take more, however coarse the finest level is.
@@ -173,15 +158,14 @@ def fitting_grid(
     Notes:
         Voxels become larger until it fits, the small ones of thick slices first, as in `pyramid_grids`.
     """
-    how = {"channels": channels, "similarity": similarity, "start": start}
-    least = min(_affine(grid, channels, _FILES[grid.dim]), estimate(grid, **how))
+    least = min(_affine(grid, channels, _FILES[grid.dim]), footprint(grid, channels, settings))
     if limit < least:
         raise InputError(
             f"--memory {readable(limit, spaced=False)} is too little for a fixed image of "
             f"{'×'.join(map(str, grid.shape[::-1]))}: give at least {readable(least, spaced=False)}, or resample it"
         )
     size, coarser = min(grid.spacing), grid
-    while estimate(coarser, **how) > limit and max(coarser.shape) > MIN_NODES:
+    while footprint(coarser, channels, settings) > limit and max(coarser.shape) > MIN_NODES:
         size /= _SHRINK
         coarser = with_voxels(grid, size)
     return coarser

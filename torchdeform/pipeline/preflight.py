@@ -1,7 +1,8 @@
-"""The pre-flight check: what looks wrong with two images, said before any work starts."""
+"""The check of two images before they are registered: what looks wrong with them, and what to do about it."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 
@@ -9,12 +10,13 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image, overlap, resample
+from torchdeform.core.image import Image, background, centre_of_mass, overlap, require_same_place, resample
+from torchdeform.core.intensities import corresponding_channels, intensity_range
 from torchdeform.core.resampling import MIN_NODES
 from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
-from torchdeform.metrics.similarity import similarity_weights
-from torchdeform.pipeline.memory import available, estimate, readable
+from torchdeform.metrics.similarity import needs_common_scale
+from torchdeform.pipeline.memory import available, footprint, readable
 from torchdeform.registration.settings import RegistrationSettings
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
@@ -24,21 +26,22 @@ _SPACINGS = (1e-3, 100.0)  # mm
 _SIZE_RATIO = 3.0
 _SCALE_RATIO = 20.0  # of the ranges of grey values
 _MOSTLY = 0.95  # share of voxels that are exactly 0
-_FILLED = 0.5  # share of the image that is left without its margins
-_FITS = 0.6  # correlation that a turned image must reach, and be better than the image as it lies
-_BETTER = 0.25  # by this much, or by leaving at most this share of what is missing to 1
-_SAME_PLACE = 1e-3  # voxels by which a mask may lie off its image
+_FILLED = 0.5  # share of the image without its empty margins
+_FITS = 0.6  # correlation that a flipped image must reach
+_BETTER = 0.25  # and it must be this much better than the image as it is, or this share closer to 1
+_BLOCKS = {2: 48, 3: 24}  # blocks along an axis of the images that are flipped
 
-# Letters of the world's axes x, y, z: where positive and negative directions point to.
+# Letters of the world axes x, y, z: what their positive and negative directions point to.
 _LETTERS = ("LR", "PA", "SI")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a check found.
+    """One thing that the check found.
 
     Attributes:
-        severity: ``error`` (it cannot work), ``warning`` (it will probably not do what is meant) or ``note``.
+        severity: ``error`` (registration is impossible), ``warning`` (the result is probably not what is meant) or
+            ``note``.
         text: one sentence that says what is wrong and what to do.
     """
 
@@ -62,19 +65,6 @@ class Report:
             raise InputError(text)
 
 
-@dataclass(frozen=True)
-class _Pair:
-    fixed: Image
-    moving: Image
-    aligned: bool
-    settings: RegistrationSettings
-
-    @property
-    def both(self) -> tuple[tuple[Image, Image], tuple[Image, Image]]:
-        """Each image with its partner."""
-        return (self.fixed, self.moving), (self.moving, self.fixed)
-
-
 def preflight(
     fixed: Image,
     moving: Image,
@@ -83,46 +73,63 @@ def preflight(
     moving_mask: Image | None = None,
     aligned: bool = False,
     settings: RegistrationSettings | None = None,
+    memory: int | None = None,
 ) -> Report:
     """Return what looks wrong with a pair of images before it is registered.
 
     Args:
         fixed: image that stays.
         moving: image that is warped onto it.
-        fixed_mask: where the fixed image counts (not 0); a grid of its own is allowed.
+        fixed_mask: where the fixed image counts (not 0); it may have another grid than the image.
         moving_mask: the same for the moving image.
-        aligned: whether an alignment comes before the deformation: images that lie apart are then no error.
+        aligned: whether the images are aligned before the deformation. Images that do not overlap are then no error.
         settings: how they will be registered; the defaults when None.
+        memory: bytes that a coarser grid keeps the registration to; None for all that is free.
 
     Returns:
-        `Report`. Nothing is raised: `Report.require_ok` does that.
+        `Report`. Errors are not raised; `Report.require_ok` does that.
 
     Notes:
-        Images are compared on coarse grids, each voxel is looked at only for its value: less than a second at 128³.
+        Images are compared on coarse grids and every voxel is read only for its value: less than a second at 128³.
     """
-    pair = _Pair(fixed, moving, aligned, settings or RegistrationSettings())
-    found = [finding for look in _ALWAYS for finding in look(pair)]
+    settings = settings or RegistrationSettings()
+    found = [
+        *_check_values(fixed),
+        *_check_values(moving),
+        *_check_nodes(fixed, ERROR),
+        *_check_nodes(moving, WARNING),
+        *_check_spacing(fixed, moving),
+        *_check_spacing(moving, fixed),
+    ]
     if fixed.grid.dim != moving.grid.dim:
-        found.append(
-            _error(f"{fixed.name} is {fixed.grid.dim}D but {moving.name} is {moving.grid.dim}D; give two of one kind")
-        )
-    elif not any(finding.severity == ERROR for finding in found):
-        found += [finding for look in _TOGETHER for finding in look(pair)]
+        kinds = f"{fixed.name} is {fixed.grid.dim}D but {moving.name} is {moving.grid.dim}D"
+        found.append(Finding(ERROR, f"{kinds}; give two of one kind"))
+    # The other checks compare the images, so they need two that are sound and of one dimension.
+    if not any(finding.severity == ERROR for finding in found):
+        found += [
+            *_check_slices(fixed),
+            *_check_slices(moving),
+            *_check_size(fixed, moving),
+            *_check_overlap(fixed, moving, aligned),
+            *_check_scale(fixed, moving, settings),
+            *_check_channels(fixed, moving),
+            *_check_orientation(fixed, moving),
+            *([] if memory else _check_memory(fixed, settings)),
+        ]
     for image, mask in ((fixed, fixed_mask), (moving, moving_mask)):
-        if mask is not None:
-            found += _about_mask(image, mask)
+        found += [] if mask is None else _check_mask(image, mask)
     order = (ERROR, WARNING, NOTE)
     return Report(tuple(sorted(found, key=lambda finding: order.index(finding.severity))))
 
 
 def orientation(image: Image) -> str:
-    """Return where the x, y and z index axes point to, as ``LPS`` (left, posterior, superior) or ``RAI``.
+    """Return what the x, y and z index axes point to, as ``LPS`` (left, posterior, superior) or ``RAI``.
 
     Args:
         image: 2D or 3D.
 
     Notes:
-        Of an oblique axis the nearest direction. Every axis gets a letter of its own pair.
+        An oblique axis gets the nearest direction. No two axes get the same pair of letters.
     """
     along = permutations(range(image.grid.dim))
     best = max(along, key=lambda axes: sum(abs(image.direction[world][k]) for k, world in enumerate(axes)))
@@ -130,233 +137,197 @@ def orientation(image: Image) -> str:
 
 
 def is_oblique(image: Image) -> bool:
-    """Return whether an axis lies off the world's axes by more than about a degree."""
+    """Return whether an axis deviates from the world axes by more than about one degree."""
     return any(max(abs(row[k]) for row in image.direction) < math.cos(0.02) for k in range(image.grid.dim))
 
 
-def _error(text: str) -> Finding:
-    return Finding(ERROR, text)
+def _check_values(image: Image) -> Iterator[Finding]:
+    """NaN, infinity, constant images, images that are 0 nearly everywhere."""
+    low, high = (float(end) for end in image.data.aminmax())
+    if not math.isfinite(low) or not math.isfinite(high):
+        count = int((~image.data.isfinite()).sum())
+        text = f"{image.name} has {count} pixels that are NaN or infinite; replace them first, for instance by 0"
+        yield Finding(ERROR, text)
+    elif low == high:
+        text = f"{image.name} is constant, so there is nothing to align; check that it is the right file"
+        yield Finding(ERROR, text)
+    elif (zeros := float((image.data == 0).float().mean())) > _MOSTLY:
+        yield Finding(WARNING, f"{image.name} is 0 in {zeros:.1%} of its pixels; crop it to what is to be aligned")
 
 
-def _warning(text: str) -> Finding:
-    return Finding(WARNING, text)
+def _check_nodes(image: Image, severity: str) -> Iterator[Finding]:
+    if min(image.grid.shape) < MIN_NODES:
+        text = (
+            f"{image.name} has the size {_size(image.grid)}; every axis needs at least {MIN_NODES} voxels: resample it"
+        )
+        yield Finding(severity, text)
 
 
-def _note(text: str) -> Finding:
-    return Finding(NOTE, text)
-
-
-def _about_values(pair: _Pair) -> Iterator[Finding]:
-    """NaN, infinity, constants, nearly nothing but zeros."""
-    for image, _ in pair.both:
-        low, high = (float(end) for end in image.data.aminmax())
-        if not math.isfinite(low) or not math.isfinite(high):
-            count = int((~image.data.isfinite()).sum())
-            yield _error(f"{image.name} has {count} pixels that are NaN or infinite; replace them first, by 0 say")
-        elif low == high:
-            yield _error(f"{image.name} is constant, so there is nothing to align; check that it is the right file")
-        elif (zeros := float((image.data == 0).float().mean())) > _MOSTLY:
-            yield _warning(f"{image.name} is 0 in {zeros:.1%} of its pixels; crop it to what is to be aligned")
-
-
-def _about_nodes(pair: _Pair) -> Iterator[Finding]:
-    for image, _ in pair.both:
-        if min(image.grid.shape) < MIN_NODES:
-            size = "×".join(map(str, image.grid.shape[::-1]))
-            text = f"{image.name} has the size {size}; every axis needs at least {MIN_NODES} voxels: resample it"
-            yield _error(text) if image is pair.fixed else _warning(text)
-
-
-def _about_spacing(pair: _Pair) -> Iterator[Finding]:
+def _check_spacing(image: Image, partner: Image) -> Iterator[Finding]:
     least, most = _SPACINGS
-    for image, partner in pair.both:
+    if min(image.grid.spacing) < least or max(image.grid.spacing) > most:
         shown = "×".join(f"{h:.4g}" for h in image.grid.spacing[::-1])
-        if min(image.grid.spacing) < least or max(image.grid.spacing) > most:
-            yield _warning(f"{image.name} has a spacing of {shown} mm; if that is not so, correct it in the header")
-        if set(image.grid.spacing) == {1.0} and set(partner.grid.spacing) != {1.0}:
-            yield _warning(
-                f"{image.name} has spacing 1 on all axes, as files that know none, but {partner.name} has another; "
-                "set the spacing in its header if it is in pixels"
-            )
+        yield Finding(WARNING, f"{image.name} has a spacing of {shown} mm; if that is not so, correct it in the header")
+    if set(image.grid.spacing) == {1.0} and set(partner.grid.spacing) != {1.0}:
+        text = (
+            f"{image.name} has spacing 1 on all axes, as files without a spacing have, but {partner.name} has another"
+        )
+        yield Finding(WARNING, f"{text}; set the spacing in its header if it is in pixels")
 
 
-def _about_slices(pair: _Pair) -> Iterator[Finding]:
-    """Slices without any contrast, inside an image or as a wide margin."""
-    for image, _ in pair.both:
-        filled = {axis: _filled(image, axis) for axis in image.grid.axes}
-        for axis, full in filled.items():
-            first, last = (int(k) for k in full.nonzero().flatten()[[0, -1]])
-            if gaps := int((~full[first:last]).sum()):
-                name, index = "zyx"[axis - 2 - image.grid.dim], first + int((~full[first:last]).nonzero()[0])
-                yield _warning(
-                    f"{image.name} has {gaps} slices along {name} that are constant among others that are not, one at "
-                    f"index {index}; export it again"
-                )
-        if (kept := math.prod(float(full.float().mean()) for full in filled.values())) < _FILLED:
-            yield _note(f"{image.name} has margins without contrast in {1 - kept:.0%} of it; cropping it saves time")
+def _check_slices(image: Image) -> Iterator[Finding]:
+    """Slices without contrast, inside an image or as a wide margin."""
+    filled = {axis: _has_contrast(image, axis) for axis in image.grid.axes}
+    for axis, full in filled.items():
+        first, last = (int(k) for k in full.nonzero().flatten()[[0, -1]])
+        if gaps := int((~full[first:last]).sum()):
+            name, index = "zyx"[axis - 2 - image.grid.dim], first + int((~full[first:last]).nonzero()[0])
+            text = f"{image.name} has {gaps} slices along {name} that are constant, between others that are not"
+            yield Finding(WARNING, f"{text} (the first has index {index}); export it again")
+    if (kept := math.prod(float(full.float().mean()) for full in filled.values())) < _FILLED:
+        text = f"{image.name} has margins without contrast in {1 - kept:.0%} of it; crop it to save time"
+        yield Finding(NOTE, text)
 
 
-def _filled(image: Image, axis: int) -> Tensor:
+def _has_contrast(image: Image, axis: int) -> Tensor:
     """Return for each slice along an axis whether it has any contrast."""
     others = [k for k in range(image.data.dim()) if k != axis]
     return image.data.amax(others) > image.data.amin(others)
 
 
-def _about_size(pair: _Pair) -> Iterator[Finding]:
-    sides = [math.prod(image.grid.extent) ** (1 / image.grid.dim) for image in (pair.fixed, pair.moving)]
-    ratio = max(sides) / min(sides)
-    if ratio > _SIZE_RATIO:
-        sizes = f"{pair.fixed.name} is {sides[0]:.4g} mm wide and {pair.moving.name} {sides[1]:.4g} mm"
-        yield _warning(f"{sizes}; check the spacings, or crop the larger one")
+def _check_size(fixed: Image, moving: Image) -> Iterator[Finding]:
+    sides = [math.prod(image.grid.extent) ** (1 / image.grid.dim) for image in (fixed, moving)]
+    if max(sides) / min(sides) > _SIZE_RATIO:
+        sizes = f"{fixed.name} is {sides[0]:.4g} mm wide and {moving.name} {sides[1]:.4g} mm"
+        yield Finding(WARNING, f"{sizes}; check the spacings, or crop the larger one")
 
 
-def _about_overlap(pair: _Pair) -> Iterator[Finding]:
-    share = max(overlap(*images) for images in pair.both)
-    names = f"{pair.fixed.name} and {pair.moving.name}"
+def _check_overlap(fixed: Image, moving: Image, aligned: bool) -> Iterator[Finding]:
+    share = max(overlap(fixed, moving), overlap(moving, fixed))
+    names = f"{fixed.name} and {moving.name}"
     if share == 0.0:
-        rest = "the alignment starts from their centres: look at the result" if pair.aligned else "align them first"
+        rest = "the alignment starts from their centres: look at the result" if aligned else "align them first"
         text = f"{names} do not overlap in physical space; correct the origin in one of the headers, or {rest}"
-        yield _warning(text) if pair.aligned else _error(text)
+        yield Finding(WARNING if aligned else ERROR, text)
     elif share < _LITTLE_OVERLAP:
-        yield _warning(f"{names} overlap by {share:.0%} only; check the origins in their headers, or align them first")
+        text = f"{names} overlap by {share:.0%} only; check the origins in their headers, or align them first"
+        yield Finding(WARNING, text)
 
 
-def _about_scale(pair: _Pair) -> Iterator[Finding]:
-    ranges = [_range(image) for image in (pair.fixed, pair.moving)]
-    ratio = max(ranges) / max(min(ranges), 1e-30)
-    if ratio > _SCALE_RATIO:
-        text = f"{pair.fixed.name} spans {ranges[0]:.4g} grey values and {pair.moving.name} {ranges[1]:.4g}"
-        if "ssd" in similarity_weights(pair.settings.similarity):
-            yield _warning(f"{text}; scale them alike, or use another similarity than ssd")
+def _check_scale(fixed: Image, moving: Image, settings: RegistrationSettings) -> Iterator[Finding]:
+    ends = (intensity_range(image.data.flatten()[None], low=0.01, high=0.99) for image in (fixed, moving))
+    ranges = [float(high - low) for low, high in ends]
+    if max(ranges) / max(min(ranges), 1e-30) > _SCALE_RATIO:
+        text = f"{fixed.name} spans {ranges[0]:.4g} grey values and {moving.name} {ranges[1]:.4g}"
+        if needs_common_scale(settings.similarity.measure):
+            yield Finding(WARNING, f"{text}; scale them alike, or use another similarity than ssd")
         else:
-            yield _note(f"{text}; scale them alike if they are of one kind and you compare them by ssd")
+            yield Finding(NOTE, f"{text}; scale them alike if they are of one kind and you compare them by ssd")
 
 
-def _range(image: Image) -> float:
-    values = image.data.flatten()
-    values = values[:: 1 + values.numel() // 2**18].sort().values
-    low, high = (float(values[round(share * (len(values) - 1))]) for share in (0.01, 0.99))
-    return high - low or float(values[-1] - values[0])
+def _check_channels(fixed: Image, moving: Image) -> Iterator[Finding]:
+    counts = [image.data.shape[1] for image in (fixed, moving)]
+    try:
+        corresponding_channels(fixed, moving)
+    except InputError as error:
+        yield Finding(ERROR, str(error))
+    else:
+        if counts[0] != counts[1]:
+            text = (
+                f"{fixed.name} has {counts[0]} channels and {moving.name} {counts[1]}; they are compared as grey values"
+            )
+            yield Finding(NOTE, f"{text}: give images of one kind to compare colours")
 
 
-def _about_channels(pair: _Pair) -> Iterator[Finding]:
-    counts = [image.data.shape[1] for image in (pair.fixed, pair.moving)]
-    if counts[0] != counts[1]:
-        yield _note(
-            f"{pair.fixed.name} has {counts[0]} channels and {pair.moving.name} {counts[1]}; they are compared as grey "
-            "values: give images of one kind to compare colours"
-        )
-
-
-def _about_orientation(pair: _Pair) -> Iterator[Finding]:
-    """Turn the moving image over along every choice of the world's axes, and see whether it fits better."""
-    scores = likeness_turned_over(pair.fixed, pair.moving)
+def _check_orientation(fixed: Image, moving: Image) -> Iterator[Finding]:
+    """Flip the moving image along every choice of the world axes, and see whether it fits better."""
+    scores = flip_correlations(fixed, moving)
     best = max(scores, key=lambda flips: scores[flips])
-    plain = scores[(1.0,) * pair.fixed.grid.dim]
+    plain = scores[(1.0,) * fixed.grid.dim]
     clearly = scores[best] > plain + _BETTER or 1 - scores[best] < _BETTER * (1 - plain)
     if scores[best] < _FITS or plain > 0.9 or not clearly:
         return
     axes = " and ".join("xyz"[k] for k, sign in enumerate(best) if sign < 0)
     kind = "mirrored" if math.prod(best) < 0 else "turned over"
-    yield _warning(
-        f"{pair.moving.name} looks {kind} along {axes}: it would fit {pair.fixed.name} with a correlation of "
+    text = (
+        f"{moving.name} looks {kind} along {axes}: it would fit {fixed.name} with a correlation of "
         f"{scores[best]:.2f} rather than {plain:.2f}; check the orientation in both headers"
     )
+    yield Finding(WARNING, text)
 
 
-def _about_memory(pair: _Pair) -> Iterator[Finding]:
-    room = available(pair.fixed.data.device)
-    grid = pair.fixed.grid
-    how = {"channels": pair.fixed.data.shape[1], "similarity": pair.settings.similarity, "start": pair.settings.start}
-    need = estimate(grid, **how)
+def _check_memory(fixed: Image, settings: RegistrationSettings) -> Iterator[Finding]:
+    room = available(fixed.data.device)
+    need = footprint(fixed.grid, fixed.data.shape[1], settings)
     if room is None or need < 0.8 * room:
         return
-    size = "×".join(map(str, grid.shape[::-1]))
     text = (
-        f"registration at {size} takes about {readable(need)} of memory and {readable(room)} are free; "
-        f"give --memory {readable(room, spaced=False)} to stop at a coarser level, or crop {pair.fixed.name}"
+        f"registration at {_size(fixed.grid)} takes about {readable(need)} of memory and {readable(room)} are free; "
+        f"give --memory {readable(room, spaced=False)} to stop at a coarser level, or crop {fixed.name}"
     )
-    yield _error(text) if need > 1.25 * room else _warning(text)
+    yield Finding(ERROR if need > 1.25 * room else WARNING, text)
 
 
-def _about_mask(image: Image, mask: Image) -> Iterator[Finding]:
-    """A mask must be of the image's kind, lie on it, and leave something."""
+def _size(grid: Grid) -> str:
+    return "×".join(map(str, grid.shape[::-1]))
+
+
+def _check_mask(image: Image, mask: Image) -> Iterator[Finding]:
+    """A mask must be of the image's dimension, overlap it, and leave something."""
     used = mask.data != 0
     if mask.grid.dim != image.grid.dim or mask.data.shape[1] != 1:
         kind = f"{mask.grid.dim}D with {mask.data.shape[1]} channels"
-        yield _error(f"{mask.name} is {kind}; the mask of {image.name} must be {image.grid.dim}D with 1 channel")
+        text = f"{mask.name} is {kind}; the mask of {image.name} must be {image.grid.dim}D with 1 channel"
+        yield Finding(ERROR, text)
     elif not bool(mask.data.isfinite().all()):
-        yield _error(f"{mask.name} has pixels that are NaN or infinite; a mask is 0 where nothing counts, else 1")
+        text = f"{mask.name} has pixels that are NaN or infinite; a mask is 0 where nothing counts, else 1"
+        yield Finding(ERROR, text)
     elif not bool(used.any()):
-        yield _error(f"{mask.name} is empty (0 everywhere), so nothing would count; check that it is the right file")
+        text = f"{mask.name} is empty (0 everywhere), so nothing would count; check that it is the right file"
+        yield Finding(ERROR, text)
     else:
-        yield from _about_place(image, mask)
+        yield from _check_mask_place(image, mask)
         if bool(used.all()):
-            yield _note(f"{mask.name} is nowhere 0, so it excludes nothing; leave it out")
+            yield Finding(NOTE, f"{mask.name} is nowhere 0, so it excludes nothing; leave it out")
 
 
-def _about_place(image: Image, mask: Image) -> Iterator[Finding]:
-    if _same_place(image, mask):
+def _check_mask_place(image: Image, mask: Image) -> Iterator[Finding]:
+    with suppress(InputError):
+        require_same_place(mask, image)
         return
-    binary = Image((mask.data != 0).float(), mask.grid, mask.origin, mask.direction, mask.name)
+    binary = replace(mask, data=(mask.data != 0).float())
     if not bool(resample(binary, image, mode="nearest").any()):
-        yield _error(f"{mask.name} excludes all of {image.name}; check the origin and spacing in its header")
+        text = f"{mask.name} excludes all of {image.name}; check the origin and spacing in its header"
+        yield Finding(ERROR, text)
     else:
-        yield _warning(
-            f"{mask.name} has another grid than {image.name}; it is taken in its physical place, which must be right: "
-            "resample it onto the image to be sure"
-        )
+        text = f"{mask.name} has another grid than {image.name}; its position in the world is used, which must be right"
+        yield Finding(WARNING, f"{text}: resample it onto the image to be sure")
 
 
-def _same_place(image: Image, mask: Image) -> bool:
-    """Return whether both grids have the same nodes in the world."""
-    if image.grid.shape != mask.grid.shape:
-        return False
-    ours, theirs = (_corners(one) for one in (image, mask))
-    return float((ours - theirs).abs().max()) <= _SAME_PLACE * min(image.grid.spacing)
-
-
-def _corners(image: Image) -> Tensor:
-    """Return the corners of Ω in the world ``(1, D, 2^D)``."""
-    corners = list(product(*((0.0, side) for side in image.grid.extent)))
-    return image.to_world(torch.tensor(corners, dtype=torch.float64).T.unsqueeze(0))
-
-
-_Look = Callable[[_Pair], Iterator[Finding]]
-
-# What can be said of each image, and what needs two sound ones of the same dimension.
-_ALWAYS: tuple[_Look, ...] = (_about_values, _about_nodes, _about_spacing)
-_TOGETHER: tuple[_Look, ...] = (
-    _about_slices, _about_size, _about_overlap, _about_scale, _about_channels, _about_orientation, _about_memory,
-)  # fmt: skip
-
-
-_COARSE = {2: 48, 3: 24}  # blocks along an axis at least, where there are so many voxels
-
-
-def likeness_turned_over(fixed: Image, moving: Image) -> dict[tuple[float, ...], float]:
-    """Return |correlation| of two images with their centres of mass together, for every way to turn one over.
+def flip_correlations(fixed: Image, moving: Image) -> dict[tuple[float, ...], float]:
+    """Return |correlation| of two images with their centres of mass together, for every flip of one of them.
 
     Args:
         fixed: image that stays.
-        moving: image that is turned over; 2D or 3D like the fixed one.
+        moving: image that is flipped; 2D or 3D like the fixed one.
 
     Returns:
-        By the signs (1 or −1) of the world's axes x, y, z about the centre of mass, a number from 0 to 1. All signs 1
-        is the image as it lies; an odd number of −1 is a mirror image.
+        A number from 0 to 1 by the signs (1 or −1) of the world axes x, y, z about the centre of mass. All signs 1 is
+        the image as it is; an odd number of −1 is a mirror image.
     """
     one, other = _coarse(fixed), _coarse(moving)
     points = one.grid.points(dtype=torch.float64, device=one.data.device)
-    world = one.to_world(points) - _centre(one)
+    here, there = (centre_of_mass(some, some.data.abs()).view(1, -1, *[1] * some.grid.dim) for some in (one, other))
+    world = one.to_world(points) - here
     return {
-        signs: _correlation(one.data, _at(other, world * one.grid.along(signs, world) + _centre(other)))
+        signs: _correlation(one.data, _at(other, world * one.grid.along(signs, world) + there))
         for signs in product((1.0, -1.0), repeat=fixed.grid.dim)
     }
 
 
 def _coarse(image: Image) -> Image:
-    """Return means over blocks of voxels and over channels, the median of the faces at 0."""
-    grey, count = image.data.float().mean(1, keepdim=True), _COARSE[image.grid.dim]
+    """Return means over blocks of voxels and over channels; the median on the faces, the background, becomes 0."""
+    grey, count = image.data.float().mean(1, keepdim=True), _BLOCKS[image.grid.dim]
     blocks = [max(1, n // count) for n in image.grid.shape]
     for axis, block in zip(image.grid.axes, blocks, strict=True):
         whole = grey.shape[axis] // block
@@ -364,16 +335,7 @@ def _coarse(image: Image) -> Image:
     first = [h * (block - 1) / 2 for h, block in zip(image.grid.spacing, blocks, strict=True)]
     origin = image.to_world(torch.tensor(first, dtype=torch.float64).view(1, -1, 1)).flatten().tolist()
     spacing = tuple(h * block for h, block in zip(image.grid.spacing, blocks, strict=True))
-    faces = torch.cat([grey.select(axis, end).flatten() for axis in image.grid.axes for end in (0, -1)])
-    return replace(image, data=grey - faces.median(), grid=Grid(tuple(grey.shape[2:]), spacing), origin=tuple(origin))
-
-
-def _centre(image: Image) -> Tensor:
-    """Return the centre of mass ``(1, D, 1, ..)`` of what stands out from the faces, in world mm."""
-    world = image.to_world(image.grid.points(dtype=torch.float64, device=image.data.device))
-    weight = image.data.abs().double()
-    mass = weight.sum().clamp(min=torch.finfo(torch.float64).tiny)
-    return (world * weight).sum(image.grid.axes, keepdim=True) / mass
+    return replace(image, data=grey - background(grey), grid=Grid(tuple(grey.shape[2:]), spacing), origin=tuple(origin))
 
 
 def _at(image: Image, world: Tensor) -> Tensor:

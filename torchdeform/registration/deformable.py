@@ -1,4 +1,4 @@
-"""Registration by flows, from the images to the result: checks, scales, places, climbs the levels, inverts, judges."""
+"""Registration by flows, from the images to the result: check, scale, place, optimise, invert, measure."""
 
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.diagnostics import Diagnosis, diagnose, inverse_error, smallest_determinant
-from torchdeform.core.fold_free import mended
+from torchdeform.core.flow import preload
+from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid, threads_worth
 from torchdeform.core.image import Image, resample
 from torchdeform.core.resampling import MIN_NODES, prolong
@@ -17,16 +18,24 @@ from torchdeform.errors import ComputationError, InputError
 from torchdeform.metrics.evaluation import evaluate_images, evaluate_tensors
 from torchdeform.registration.affine.align import Alignment, align
 from torchdeform.registration.discrete import discrete_start
-from torchdeform.registration.optimise import climb_levels, compare_from_fixed
-from torchdeform.registration.problem import Guidance, Scene, Subject, moved, place, subjects, tensor_scene
+from torchdeform.registration.optimise import forward_similarity, optimise_levels
+from torchdeform.registration.problem import (
+    Guidance,
+    PlacedImage,
+    RegistrationProblem,
+    moved,
+    placed_images,
+    problem_of_tensors,
+    resample_pair,
+)
 from torchdeform.registration.result import Callback, LevelRecord, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.symmetric import (
-    Middle,
-    between_images,
-    between_tensors,
-    climb_from_middle,
+    MidSpace,
     common_axes,
+    midspace_of_images,
+    midspace_of_tensors,
+    optimise_symmetric,
 )
 
 
@@ -72,33 +81,35 @@ def register(
         ``symmetric`` two maps from a space between move against each other, and φ = φ_m ∘ φ_f⁻¹.
     """
     settings, guidance = config or RegistrationSettings(), guidance or Guidance()
+    preload()
     if isinstance(fixed, Image) and isinstance(moving, Image):
-        return _register_images((fixed, moving), settings, guidance, affine, start, callback)
+        return _register_images(fixed, moving, settings, guidance, affine, start, callback)
     if isinstance(fixed, Image) or isinstance(moving, Image):
         raise InputError("register: fixed and moving must be two tensors or two Images, not one of each")
     if affine is not None:
         raise InputError("register: affine is a map of the world, so fixed and moving must be Images")
-    return _register_tensors((fixed, moving), settings, guidance, start, callback)
+    return _register_tensors(fixed, moving, settings, guidance, start, callback)
 
 
 def _register_tensors(
-    images: tuple[Tensor, Tensor],
+    fixed: Tensor,
+    moving: Tensor,
     settings: RegistrationSettings,
     guidance: Guidance,
     start: Tensor | None,
     callback: Callback | None,
 ) -> RegistrationResult:
-    fixed, moving = images
     grid = _checked_grid(fixed, moving, guidance)
-    scene = tensor_scene(fixed, moving, grid, guidance)
-    _require_finite(scene)
-    scene = scene.scaled(settings)
-    climbed = _climb(scene, between_tensors(scene) if settings.symmetric else None, settings, start, callback)
-    del scene
-    with threads_worth(len(climbed.u), grid):
-        warped = warp(moving, climbed.u, grid)
-        evaluation = evaluate_tensors(climbed.u, grid, labels=guidance.labels, points=guidance.points)
-    return replace(_finish(climbed, grid, warped, settings), evaluation=evaluation)
+    problem = problem_of_tensors(fixed, moving, grid, guidance)
+    _require_finite(problem)
+    problem = problem.scaled(settings)
+    space = midspace_of_tensors(problem) if settings.symmetric else None
+    found = _optimise(problem, space, settings, start, callback)
+    del problem, space
+    with threads_worth(len(found.u), grid):
+        warped = warp(moving, found.u, grid)
+        evaluation = evaluate_tensors(found.u, grid, labels=guidance.labels, points=guidance.points)
+    return replace(_result(found, grid, warped, settings), evaluation=evaluation)
 
 
 def _checked_grid(fixed: Tensor, moving: Tensor, guidance: Guidance) -> Grid:
@@ -114,8 +125,8 @@ def _checked_grid(fixed: Tensor, moving: Tensor, guidance: Guidance) -> Grid:
     return grid
 
 
-def _require_finite(scene: Scene) -> None:
-    for name, image in (("fixed", scene.fixed), ("moving", scene.moving)):
+def _require_finite(problem: RegistrationProblem) -> None:
+    for name, image in (("fixed", problem.fixed), ("moving", problem.moving)):
         if not bool(image.isfinite().all()):
             raise InputError(f"register: {name} has values that are NaN or infinite; replace or mask them first")
 
@@ -126,7 +137,8 @@ def _require_size(grid: Grid) -> None:
 
 
 def _register_images(
-    images: tuple[Image, Image],
+    fixed: Image,
+    moving: Image,
     settings: RegistrationSettings,
     guidance: Guidance,
     affine: Affine | None,
@@ -134,58 +146,59 @@ def _register_images(
     callback: Callback | None,
 ) -> RegistrationResult:
     """Take the moving image onto the fixed grid in its physical place, register, and sample the original once."""
-    fixed, moving = images
     _require_size(fixed.grid)
     guidance.require_images(fixed.grid.dim)
-    scene, middle, affine, alignment = _placed(fixed, moving, settings, guidance, affine)
-    climbed = _climb(scene, middle, settings, start, callback)
-    del scene, middle
-    seen = moving if affine is None else moved(moving, affine.inverse())
-    warped = resample(seen, fixed, climbed.u).to(moving.data.dtype)
-    result = _finish(climbed, fixed.grid, warped, settings)
+    both, alignment = placed_images(fixed, moving, guidance), None
+    if affine is None and settings.align.kind != "none":
+        alignment = _align(fixed, moving, settings, guidance)
+        affine = alignment.affine
+    aligned = both[1] if affine is None else both[1].moved(affine.inverse())
+    problem = resample_pair(both[0], aligned, fixed).scaled(settings)
+    space = _midspace(*both, problem, affine, settings) if settings.symmetric else None
+    found = _optimise(problem, space, settings, start, callback)
+    del problem, space
+    warped = _warped(fixed, moving, affine, found.u)
+    result = _result(found, fixed.grid, warped, settings)
     return replace(
         result,
         affine=affine,
         alignment=alignment,
-        evaluation=evaluate_images(fixed, affine, climbed.u, labels=guidance.labels, points=guidance.points),
+        evaluation=evaluate_images(fixed, affine, found.u, labels=guidance.labels, points=guidance.points),
         seconds=({"align": alignment.seconds} if alignment else {}) | result.seconds,
     )
 
 
-def _placed(
-    fixed: Image, moving: Image, settings: RegistrationSettings, guidance: Guidance, affine: Affine | None
-) -> tuple[Scene, Middle | None, Affine | None, Alignment | None]:
-    """Return the scene on the fixed grid, with ``symmetric`` the space between, the affine map, how it was found."""
-    both, alignment = subjects(fixed, moving, guidance), None
-    if affine is None and settings.align != "none":
-        alignment = _aligned(fixed, moving, settings, guidance)
-        affine = alignment.affine
-    there = both[1] if affine is None else both[1].moved(affine.inverse())
-    scene = place(both[0], there, fixed).scaled(settings)
-    return scene, _between(both, scene, affine, settings) if settings.symmetric else None, affine, alignment
-
-
-def _aligned(fixed: Image, moving: Image, settings: RegistrationSettings, guidance: Guidance) -> Alignment:
+def _align(fixed: Image, moving: Image, settings: RegistrationSettings, guidance: Guidance) -> Alignment:
     """Align as the settings say, with masks."""
     masks = (guidance.fixed_mask, guidance.moving_mask)
     first, second = (mask if isinstance(mask, Image) else None for mask in masks)
-    return align(fixed, moving, settings.align, fixed_mask=first, moving_mask=second)
+    return align(fixed, moving, fixed_mask=first, moving_mask=second, settings=settings.align)
 
 
-def _between(
-    both: tuple[Subject, Subject], scene: Scene, affine: Affine | None, settings: RegistrationSettings
-) -> Middle:
-    """Return the middle space of two images; where they share a grid and a place it is theirs."""
-    places = [(s.image.grid, s.image.origin, s.image.direction) for s in both]
+def _midspace(
+    fixed: PlacedImage,
+    moving: PlacedImage,
+    problem: RegistrationProblem,
+    affine: Affine | None,
+    settings: RegistrationSettings,
+) -> MidSpace:
+    """Return the space between two images; where they share a grid and a place it is theirs."""
+    places = [(s.image.grid, s.image.origin, s.image.direction) for s in (fixed, moving)]
     if affine is None and places[0] == places[1]:
-        return between_tensors(scene)
-    middle = between_images(*both, affine, common_axes(both[0].image, both[1].image))
-    return replace(middle, scene=middle.scene.scaled(settings))
+        return midspace_of_tensors(problem)
+    space = midspace_of_images(fixed, moving, affine, common_axes(fixed.image, moving.image))
+    return replace(space, problem=space.problem.scaled(settings))
+
+
+def _warped(fixed: Image, moving: Image, affine: Affine | None, u: Tensor) -> Tensor:
+    """Return the moving image on the fixed grid, sampled once."""
+    seen = moving if affine is None else moved(moving, affine.inverse())
+    return resample(seen, fixed, u).to(moving.data.dtype)
 
 
 @dataclass(frozen=True)
-class _Climbed:
-    """Where the climb ended: the displacement on the fixed grid, how each level went, similarities, seconds."""
+class _Optimised:
+    """Where the loop ended: the displacement on the fixed grid, how each level went, similarities, seconds."""
 
     u: Tensor
     records: tuple[LevelRecord, ...]
@@ -194,63 +207,60 @@ class _Climbed:
     seconds: float
 
 
-def _climb(
-    scene: Scene,
-    middle: Middle | None,
+def _optimise(
+    problem: RegistrationProblem,
+    space: MidSpace | None,
     settings: RegistrationSettings,
     start: Tensor | None,
     callback: Callback | None,
-) -> _Climbed:
-    """Climb from the fixed grid or from the middle; the images as they are compared are needed no more then."""
+) -> _Optimised:
+    """Optimise on the fixed grid or in the space between; the images as they are compared are needed no more then."""
+    began = perf_counter()
     if start is not None:
-        start = _checked_start(start, scene)
+        start = _checked_start(start, problem)
     elif settings.start == "discrete":
-        start = discrete_start(scene.fixed, scene.moving, scene.grid, mask=scene.fixed_mask)
-    if middle is not None:
-        u, records = climb_from_middle(middle, scene.grid, settings, start, callback)
+        start = discrete_start(
+            problem.fixed, problem.moving, problem.grid, mask=problem.fixed_mask, settings=settings.discrete
+        )
+    if space is not None:
+        u, records = optimise_symmetric(space, problem.grid, settings, start, callback)
     else:
-        u, records = climb_levels(scene, settings, start, callback)
-    climbed = perf_counter()
-    with threads_worth(len(u), scene.grid):
-        comparison = compare_from_fixed(scene, settings)
-        before, after = comparison.look()[1], comparison.look(u)[1]
-    seconds = sum(record.seconds for record in records) + perf_counter() - climbed
-    return _Climbed(u, records, before, after, seconds)
+        u, records = optimise_levels(problem, settings, start, callback)
+    with threads_worth(len(u), problem.grid):
+        similarity = forward_similarity(problem, settings)
+        before, after = similarity.evaluate()[1], similarity.evaluate(u)[1]
+    return _Optimised(u, records, before, after, perf_counter() - began)
 
 
-def _checked_start(start: Tensor, scene: Scene) -> Tensor:
-    grid = scene.grid
+def _checked_start(start: Tensor, problem: RegistrationProblem) -> Tensor:
+    grid = problem.grid
     grid.check_vector(start, "register: start")
-    if len(start) != len(scene.fixed):
-        raise InputError(f"register: start must have {len(scene.fixed)} batch items, got {len(start)}")
+    if len(start) != len(problem.fixed):
+        raise InputError(f"register: start must have {len(problem.fixed)} batch items, got {len(start)}")
     if not bool((smallest_determinant(start, grid) > 0).all()):
         raise InputError("register: start folds or is not finite; smooth it, or scale it down")
-    return start.to(scene.fixed)
+    return start.to(problem.fixed)
 
 
-def _finish(climbed: _Climbed, grid: Grid, warped: Tensor, settings: RegistrationSettings) -> RegistrationResult:
-    """Invert the map and judge it."""
-    with threads_worth(len(climbed.u), grid):
+def _result(found: _Optimised, grid: Grid, warped: Tensor, settings: RegistrationSettings) -> RegistrationResult:
+    """Invert the map and measure it."""
+    with threads_worth(len(found.u), grid):
         start = perf_counter()
-        inverse = invert(climbed.u, grid)
-        mean, largest = inverse_error(climbed.u, inverse, grid)
+        inverse = invert(found.u, grid)
+        mean, largest = inverse_error(found.u, inverse, grid)
         inverted = perf_counter()
         return RegistrationResult(
-            displacement=climbed.u,
+            displacement=found.u,
             inverse=inverse,
             warped=warped,
             grid=grid,
-            similarity_before=climbed.before,
-            similarity_after=climbed.after,
-            diagnosis=_require_sound(climbed.u, grid),
+            similarity_before=found.before,
+            similarity_after=found.after,
+            diagnosis=_require_sound(found.u, grid),
             inverse_error_mean=mean,
             inverse_error_max=largest,
-            levels=climbed.records,
-            seconds={
-                "register": climbed.seconds,
-                "invert": inverted - start,
-                "diagnose": perf_counter() - inverted,
-            },
+            levels=found.records,
+            seconds={"register": found.seconds, "invert": inverted - start, "diagnose": perf_counter() - inverted},
             settings=settings,
         )
 
@@ -258,13 +268,13 @@ def _finish(climbed: _Climbed, grid: Grid, warped: Tensor, settings: Registratio
 def _require_sound(u: Tensor, grid: Grid) -> Diagnosis:
     if not bool(u.isfinite().all()):
         raise ComputationError(
-            "register: the map is not finite; check the images for extreme values, or lower step_length"
+            "register: the map is not finite; check the images for extreme values, or lower optimiser.step_length"
         )
     return diagnose(u, grid)
 
 
 @torch.no_grad()
-def onto_grid(result: RegistrationResult, fixed: Image, moving: Image, guidance: Guidance) -> RegistrationResult:
+def resample_result(result: RegistrationResult, fixed: Image, moving: Image, guidance: Guidance) -> RegistrationResult:
     """Return the result on the grid of ``fixed``, everything that follows from its maps made anew.
 
     Args:
@@ -274,19 +284,18 @@ def onto_grid(result: RegistrationResult, fixed: Image, moving: Image, guidance:
         guidance: labels and landmarks to measure.
 
     Returns:
-        The result with both maps interpolated linearly, which keeps them fold-free or mends them; similarities are
+        The result with both maps interpolated linearly, and repaired where that folds them; similarities are
         those of the grid on which it was found.
     """
     grid = fixed.grid
-    u, inverse = (mended(prolong(w, grid), grid) for w in (result.displacement, result.inverse))
+    u, inverse = (repair_folds(prolong(w, grid), grid) for w in (result.displacement, result.inverse))
     mean, largest = inverse_error(u, inverse, grid)
-    seen = moving if result.affine is None else moved(moving, result.affine.inverse())
     return replace(
         result,
         displacement=u,
         inverse=inverse,
         grid=grid,
-        warped=resample(seen, fixed, u).to(moving.data.dtype),
+        warped=_warped(fixed, moving, result.affine, u),
         diagnosis=diagnose(u, grid),
         inverse_error_mean=mean,
         inverse_error_max=largest,

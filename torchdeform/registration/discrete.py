@@ -7,25 +7,25 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchdeform.core.flow import integrate
-from torchdeform.core.fold_free import mended
+from torchdeform.core.flow import OdeSolver, flow
+from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import MIN_NODES, prolong, pyramid_grids, restrict
 from torchdeform.core.warp import compose, warp
 from torchdeform.errors import InputError
-from torchdeform.fem.fast_transform import TransformSolver
-from torchdeform.fem.form import Row, Term
-from torchdeform.fem.operator import assemble_load
+from torchdeform.fem.solver import SolverSettings
 from torchdeform.fem.weights import Weights
 from torchdeform.metrics.mind import mind_ssc
+from torchdeform.registration.settings import DiscreteSettings
+from torchdeform.registration.velocity import VelocityMetric
 from torchdeform.solvers.sine_cosine import inverse_transform, transform
 
 # Rounds in which the two directions are made inverse to each other, and in which a velocity is fitted to matches.
 _ROUNDS = 15
 _FITS = 5
 
-# Midpoint steps of the flow that is fitted.
-_FLOW_STEPS = 6
+# How the flow that is fitted is integrated.
+_FLOW = OdeSolver(method="midpoint", steps=6)
 
 # Costs are divided by their standard deviation, which counts as no smaller than this (features lie in [0, 1]).
 _SMALLEST_SCALE = 1e-2
@@ -36,54 +36,6 @@ _SMALLEST_WEIGHT = 0.01
 # Entries of a temporary, and entries of the cost volume at most (2 GiB in float32).
 _CHUNK = 2**22
 _LARGEST_VOLUME = 2**29
-
-
-@dataclass(frozen=True, kw_only=True)
-class DiscreteSettings:
-    """How far and how finely to search, and how smooth the result is.
-
-    Args:
-        levels: pyramid levels to search on, coarse to fine, 0 being the images' own: displacements on level l are
-            multiples of 2^l voxels.
-        reach: longest displacement along an axis tried on each of them, in voxels of the images. A later level
-            corrects the ones before.
-        spacing: distance of the control points in displacements of one step, at least 1.
-        smoothing: standard deviation of the Gaussian that the field is smoothed with, in control points.
-        coupling: prices of a squared step between a control point and the smooth field, in standard deviations of the
-            matching cost; they rise from the first round to the last, and with them the agreement of neighbours.
-        symmetric: match moving to fixed as well, and keep what both directions agree on; takes twice as long.
-        length: range of the metric in which the flow is fitted to the matches, in control points.
-        min_determinant: smallest one-sided determinant of the result.
-
-    Raises:
-        InputError: a value out of range, named.
-    """
-
-    levels: tuple[int, ...] = (2, 1)
-    reach: tuple[float, ...] = (20.0, 6.0)
-    spacing: float = 2.0
-    smoothing: float = 1.5
-    coupling: tuple[float, ...] = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
-    symmetric: bool = True
-    length: float = 2.0
-    min_determinant: float = 0.1
-
-    def __post_init__(self) -> None:
-        if not self.levels or len(self.levels) != len(self.reach):
-            raise InputError(f"levels and reach must have one entry each per level, got {self.levels}, {self.reach}")
-        if min(self.levels) < 0 or list(self.levels) != sorted(self.levels, reverse=True):
-            raise InputError(f"levels must not be negative and must run from coarse to fine, got {self.levels}")
-        if not self.coupling:
-            raise InputError("coupling must have at least one price")
-        positive = {"reach": self.reach, "coupling": self.coupling}
-        positive |= {name: (getattr(self, name),) for name in ("smoothing", "length", "min_determinant")}
-        for name, values in positive.items():
-            if not all(0 < value < math.inf for value in values):
-                raise InputError(f"{name} must be positive and finite, got {getattr(self, name)}")
-        if not 1 <= self.spacing < math.inf:
-            raise InputError(f"spacing must be at least 1, got {self.spacing}")
-        if self.min_determinant >= 1:
-            raise InputError(f"min_determinant must be below 1, got {self.min_determinant}")
 
 
 @torch.no_grad()
@@ -151,7 +103,7 @@ def _start(fixed: Tensor, moving: Tensor, mask: Tensor | None, grid: Grid, setti
             matches = _agreed(matches, _match(search, warped, fixed, mask), search.control)
         u = restrict(u, grid, search.features)
         u = _fit_flow(compose(u, prolong(matches, search.features), search.features), search)
-        u = mended(prolong(u, grid), grid, settings.min_determinant)
+        u = repair_folds(prolong(u, grid), grid, settings.min_determinant)
     return u
 
 
@@ -287,14 +239,12 @@ def _agreed(forward: Tensor, backward: Tensor, grid: Grid) -> Tensor:
 
 
 def _fit_flow(target: Tensor, search: _Search) -> Tensor:
-    """Return u of a flow near ``target``, both on the grid of the features."""
+    """Return u of a flow near ``target``, both on the grid of the features: v ← v + (1 + length² Δ)⁻¹(target − u)."""
     grid = search.features
-    square = (search.settings.length * search.control.cell_volume ** (1 / grid.dim)) ** 2
-    weights = Weights(div=square, curl=square, zero=1.0)
-    metric = TransformSolver(grid, weights, "slip", dtype=target.dtype, device=target.device)
-    controls = tuple(Row(1.0, (Term(1.0, k, None),)) for k in range(grid.dim))
+    square = (search.settings.length_scale * search.control.cell_volume ** (1 / grid.dim)) ** 2
+    metric = VelocityMetric.of_weights(grid, Weights(div=square, curl=square, zero=1.0), SolverSettings(), target)
     v = u = torch.zeros_like(target)
     for _ in range(_FITS):
-        v = v + metric.solve(assemble_load(controls, target - u, grid))
-        u = integrate(v, grid, steps=_FLOW_STEPS, method="midpoint")
+        v = v + metric.velocity(target - u)
+        u = flow(v, grid, _FLOW)
     return u

@@ -19,31 +19,34 @@ _LEAP = 2.0
 
 
 @dataclass(frozen=True)
-class Pull:
+class LandmarkForce:
     """What the landmarks ask for.
 
     Attributes:
         distance: mean squared distance of the pairs in squared units of spacing ``(B,)``.
-        at: grid points ``(sides·B, D, n)`` where the maps' domain is to be moved.
-        arrows: the displacement wanted there, likewise.
-        slopes: Jacobian of the map there ``(B, n, D, D)``; None for two maps, whose points move with their domain.
+        points: grid points ``(B, D, n)`` where the maps' domain is to be moved.
+        residuals: the displacement wanted there, likewise.
+        slopes: Jacobian of the map there ``(B, n, D, D)``; None where the points move with the domain, and those of
+            the two maps of a pair, half a batch apart, move against each other.
     """
 
     distance: Tensor
-    at: Tensor
-    arrows: Tensor
+    points: Tensor
+    residuals: Tensor
     slopes: Tensor | None = None
 
     def load(self, grid: Grid) -> Tensor:
-        """Return minus the derivative of ``distance`` by a velocity of the domain, at every node ``(.., D, *S)``."""
-        arrows = self.arrows if self.slopes is None else _times(self.slopes.transpose(2, 3), self.arrows)
-        return spread(arrows * (2 / arrows.shape[2]), self.at, grid)
+        """Return minus the derivative of ``distance`` by a velocity of the domain, at every node ``(B, D, *S)``."""
+        residuals = self.residuals if self.slopes is None else _times(self.slopes.transpose(2, 3), self.residuals)
+        return scatter_points(residuals * (2 / residuals.shape[2]), self.points, grid)
 
-    def reach(self, v: Tensor, grid: Grid) -> Tensor:
+    def line_search(self, v: Tensor, grid: Grid) -> Tensor:
         """Return the multiple of the velocity v that brings the pairs nearest to each other, ``(B,)``."""
-        moved, items = sample(v, self.at, grid), len(self.distance)
-        moved = moved - moved.roll(items, 0) if self.slopes is None else _times(self.slopes, moved)
-        work, square = ((x * moved).flatten(1).sum(1).view(-1, items).sum(0) for x in (self.arrows, moved))
+        moved = sample(v, self.points, grid)
+        moved = moved - _of_other_map(moved) if self.slopes is None else _times(self.slopes, moved)
+        work, square = ((x * moved).flatten(1).sum(1) for x in (self.residuals, moved))
+        if self.slopes is None:  # the maps of a pair go the same way
+            work, square = work + _of_other_map(work), square + _of_other_map(square)
         return work / square.clamp(min=torch.finfo(v.dtype).tiny)
 
 
@@ -51,8 +54,8 @@ class Landmarks(ABC):
     """Pairs of points on one grid."""
 
     @abstractmethod
-    def look(self, u: Tensor) -> Pull:
-        """Return what the pairs ask of the maps u ``(sides·B, D, *S)``."""
+    def evaluate(self, u: Tensor) -> LandmarkForce:
+        """Return what the pairs ask of the maps u ``(B, D, *S)``."""
 
 
 class ForwardLandmarks(Landmarks):
@@ -67,13 +70,13 @@ class ForwardLandmarks(Landmarks):
     def __init__(self, fixed: Tensor, moving: Tensor, grid: Grid) -> None:
         self.fixed, self.moving, self.grid = fixed, moving, grid
 
-    def look(self, u: Tensor) -> Pull:
-        arrows = self.moving - _mapped(u, self.fixed, self.grid)
-        return Pull(_mean_square(arrows), self.fixed, arrows, _slopes(u, self.fixed, self.grid))
+    def evaluate(self, u: Tensor) -> LandmarkForce:
+        residuals = self.moving - _mapped(u, self.fixed, self.grid)
+        return LandmarkForce(_mean_square(residuals), self.fixed, residuals, _slopes(u, self.fixed, self.grid))
 
 
-class MiddleLandmarks(Landmarks):
-    """E = mean over the pairs of |φ_f⁻¹(p) − φ_m⁻¹(q)|², for two maps that start in the space between.
+class MidspaceLandmarks(Landmarks):
+    """E = mean over the pairs of |φ_f⁻¹(p) − φ_m⁻¹(q)|², for the two maps of a pair, half a batch apart.
 
     Args:
         fixed: p ``(B, D, n)`` in grid points.
@@ -81,32 +84,30 @@ class MiddleLandmarks(Landmarks):
         grid: the grid.
 
     Notes:
-        Remembers where the points were and goes on from there: ask along one path of maps.
+        Newton's method begins where the points were found the time before: fast along one path of maps, right on any.
     """
 
     def __init__(self, fixed: Tensor, moving: Tensor, grid: Grid) -> None:
         self.ends, self.grid = torch.cat([fixed, moving]), grid
-        self.at, self.steps = self.ends, _FIRST
+        self.points, self.steps = self.ends, _FIRST
 
-    def look(self, u: Tensor) -> Pull:
+    def evaluate(self, u: Tensor) -> LandmarkForce:
         for _ in range(self.steps):
-            defect = self.ends - _mapped(u, self.at, self.grid)
-            leap = _solved(_slopes(u, self.at, self.grid), defect)
+            defect = self.ends - _mapped(u, self.points, self.grid)
+            leap = _solved(_slopes(u, self.points, self.grid), defect)
             voxels = (leap / leap.new_tensor(self.grid.spacing).view(1, -1, 1)).norm(dim=1, keepdim=True)
-            self.at = self.at + leap * (_LEAP / voxels.clamp(min=_LEAP))
-        self.steps, items = _AGAIN, len(self.ends) // 2
-        arrows = self.at - self.at.roll(items, 0)  # φ ∘ flow(v) takes to p what was at v from there
-        return Pull(_mean_square(arrows[:items]), self.at, arrows)
+            self.points = self.points + leap * (_LEAP / voxels.clamp(min=_LEAP))
+        self.steps = _AGAIN
+        residuals = self.points - _of_other_map(self.points)  # φ ∘ flow(v) takes to p what was at v from there
+        return LandmarkForce(_mean_square(residuals), self.points, residuals)
 
 
-def make_landmarks(fixed: Tensor | None, moving: Tensor | None, grid: Grid, sides: int) -> Landmarks | None:
-    """Return the landmarks for one map or two, None without points."""
-    if fixed is None or moving is None:
-        return None
-    return (ForwardLandmarks if sides == 1 else MiddleLandmarks)(fixed, moving, grid)
+def _of_other_map(values: Tensor) -> Tensor:
+    """Return for each map of a pair what belongs to the other, half a batch away."""
+    return values.roll(len(values) // 2, 0)
 
 
-def spread(values: Tensor, points: Tensor, grid: Grid) -> Tensor:
+def scatter_points(values: Tensor, points: Tensor, grid: Grid) -> Tensor:
     """Return Σ_i value_i N(p_i) at the nodes, the transpose of linear interpolation at the points.
 
     Args:
@@ -165,5 +166,5 @@ def _solved(matrices: Tensor, vectors: Tensor) -> Tensor:
     return torch.linalg.solve_ex(matrices, vectors.transpose(1, 2).unsqueeze(3))[0].squeeze(3).transpose(1, 2)
 
 
-def _mean_square(arrows: Tensor) -> Tensor:
-    return arrows.square().sum(1).mean(1)
+def _mean_square(residuals: Tensor) -> Tensor:
+    return residuals.square().sum(1).mean(1)

@@ -1,111 +1,144 @@
-"""Climbing the levels: forces ask for divergence and curl, least squares give the velocity, its flow moves the maps."""
+"""The loop of every registration: forces of the images give velocities by least squares, whose flows move the maps."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from time import perf_counter
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchdeform.core.derivatives import derivative
 from torchdeform.core.diagnostics import one_sided_determinant
-from torchdeform.core.fold_free import advance, keep, mended
+from torchdeform.core.flow import flow
+from torchdeform.core.fold_free import largest_share, repair_folds, smooth_elastically, where_items
 from torchdeform.core.grid import Grid, per_item, threads_worth
 from torchdeform.core.resampling import Transfer, prolong, pyramid_grids, thinned
-from torchdeform.core.warp import warp
-from torchdeform.fem.fast_transform import TransformSolver
-from torchdeform.fem.form import Form, Row, Term
-from torchdeform.fem.operator import assemble_load
-from torchdeform.fem.weights import Weights
+from torchdeform.core.warp import compose, warp
+from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity
 from torchdeform.metrics.similarity import features, make_similarity
-from torchdeform.registration.landmarks import Landmarks, Pull, make_landmarks
-from torchdeform.registration.problem import Scene
+from torchdeform.registration.landmarks import ForwardLandmarks, Landmarks
+from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.result import Callback, LevelRecord, Progress
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.velocity import (
+    LAST_STEP,
+    VelocityMetric,
+    fold_barrier,
+    image_force,
+    normalise_step,
+    points_scale,
+    step_size,
+)
+
+# Steps over which a level must have gained, see `OptimiserSettings.tolerance`.
+_PATIENCE = 5
+
+# Levels whose images have more nodes than this carry the map on the coarser grid of `OptimiserSettings.map_spacing`.
+# Mouse brains (10^6 nodes) gain 0.003 Dice and half of the time by it; slices and hippocampi (7·10^4) would lose 0.01.
+_LARGE = 2**17
+
+# How often a step that would fold is halved before it is left out.
+_HALVINGS = 6
+
+
+class Coupling:
+    """Which maps of a batch move together; here each by itself."""
+
+    def velocity(self, v: Tensor) -> Tensor:
+        """Return the velocities ``(B, D, *S)`` that the maps may move by."""
+        return v
+
+    def all(self, flags: Tensor) -> Tensor:
+        """Return for each map whether all that move together are flagged, ``(B,)``."""
+        return flags
+
+
+_FREE = Coupling()
 
 
 @dataclass(frozen=True)
-class Comparison:
+class SimilarityTerm:
     """Images on one grid, ready to be compared again and again.
 
     Attributes:
         grid: their grid.
-        images: what the maps warp ``(sides·B, C, *S)``: the moving image, or first the fixed and then the moving one.
+        images: what the maps warp ``(B, C, *S)``.
         similarity: of the warped images.
-        masks: their masks, warped likewise, or None.
-        still: a mask that is not warped, or None.
-        sides: maps of a pair, 1, or 2 where both images are warped.
+        masks: masks that are warped with them ``(B, 1, *S)``, or None.
+        fixed_mask: a mask that is not warped, or None.
     """
 
     grid: Grid
     images: Tensor
     similarity: Similarity
     masks: Tensor | None = None
-    still: Tensor | None = None
-    sides: int = 1
+    fixed_mask: Tensor | None = None
 
-    def look(self, u: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the images warped by u ``(sides·B, D, *S)``, as they are when None, S per pair, and N ∂S/∂warped."""
+    def evaluate(self, u: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the images warped by u ``(B, D, *S)``, as they are when None, S of each, and N ∂S/∂warped."""
         warped = self._masked if u is None else warp(self._masked, u, self.grid)
         del u  # where a coarser grid carries the map, nobody else holds it
         if self.masks is None:
-            return warped, *self.similarity.evaluate(warped, self.still)
+            return warped, *self.similarity.evaluate(warped, self.fixed_mask)
         warped, mask = warped.tensor_split([-1], dim=1)
-        return warped, *self.similarity.evaluate(warped.contiguous(), self._weight(mask))
+        mask = mask if self.fixed_mask is None else mask * self.fixed_mask
+        return warped, *self.similarity.evaluate(warped.contiguous(), mask)
 
     @cached_property
     def _masked(self) -> Tensor:
         """The images and their masks, side by side: one sampling costs less than two."""
         return self.images if self.masks is None else torch.cat([self.images, self.masks], dim=1)
 
-    def _weight(self, mask: Tensor) -> Tensor:
-        """Return the product of the masks where the maps have taken them."""
-        other = self.still if self.sides == 1 else _of_other_side(mask)
-        return mask if other is None else mask * other
 
-
-# Steps over which a level must have gained, see `RegistrationSettings.tolerance`.
-_PATIENCE = 5
-
-
-# The step falls to this share of itself over a level.
-_LAST_STEP = 0.1
-
-
-# Levels whose images have more nodes than this carry the map on the coarser grid of `RegistrationSettings.map_spacing`.
-# Mouse brains (10^6 nodes) gain 0.003 Dice and half of the time by it; slices and hippocampi (7·10^4) would lose 0.01.
-_LARGE = 2**17
-
-
-# Weight of the divergence that opens up nearly folded places, against a force of 1 at its strongest.
-_RESISTANCE = 3.0
+def forward_similarity(problem: RegistrationProblem, settings: RegistrationSettings) -> SimilarityTerm:
+    """Return the similarity of the fixed and the warped moving image."""
+    measure, window = settings.similarity.measure, settings.similarity.window
+    fixed, moving = (features(measure, image) for image in (problem.fixed, problem.moving))
+    similarity = make_similarity(measure, fixed, window, grid=problem.grid)
+    return SimilarityTerm(problem.grid, moving, similarity, problem.moving_mask, problem.fixed_mask)
 
 
 @dataclass(frozen=True)
-class _Level:
+class Objective:
+    """What is maximised on the grid of one level, S − points_weight · E, and which maps move together.
+
+    Attributes:
+        similarity: S of the images, on their grid.
+        landmarks: E of the pairs of points, on the grid of the map; None without.
+        coupling: of the maps.
+    """
+
+    similarity: Any
+    landmarks: Landmarks | None = None
+    coupling: Coupling = _FREE
+
+
+@dataclass(frozen=True)
+class Level:
     """What stays the same during the steps of one level.
 
     Attributes:
-        index: its number, 0 is the coarsest.
-        comparison: of the images, on their grid.
-        landmarks: pairs of points that pull, or None.
-        metric: the least-squares operator.
-        held: its weight w_0 of the velocity itself.
-        controls: the form of the load: divergence and force.
+        objective: what is maximised.
+        metric: of the velocities, on the grid of the map.
         settings: the settings.
+        steps: steps at most.
+        index: its number, 0 is the coarsest.
+        levels: how many there are.
         transfer: between the grid of the images and that of the map, None where they are one.
+        keep_best: end at the best map that was met, and stop where nothing is gained; otherwise make all steps.
     """
 
-    index: int
-    comparison: Comparison
-    landmarks: Landmarks | None
-    metric: TransformSolver
-    held: float
-    controls: Form
+    objective: Objective
+    metric: VelocityMetric
     settings: RegistrationSettings
+    steps: int
+    index: int = 0
+    levels: int = 1
     transfer: Transfer | None = None
+    keep_best: bool = True
 
     @property
     def grid(self) -> Grid:
@@ -113,196 +146,204 @@ class _Level:
         return self.metric.grid
 
     @property
-    def sides(self) -> int:
-        """Maps of a pair."""
-        return self.comparison.sides
+    def shape(self) -> tuple[int, ...]:
+        """The grid of the level's images."""
+        return self.objective.similarity.grid.shape
+
+    @property
+    def zero(self) -> Tensor:
+        """Maps that are the identity, ``(B, D, *S)``."""
+        images = self.objective.similarity.images
+        return images.new_zeros(len(images), self.grid.dim, *self.grid.shape)
 
 
-def climb_levels(
-    scene: Scene, settings: RegistrationSettings, start: Tensor | None, callback: Callback | None
+@dataclass(frozen=True)
+class State:
+    """Where the maps of a level are.
+
+    Attributes:
+        u: displacements ``(B, D, *S)`` in units of spacing.
+        lowest: their smallest one-sided determinant at each node ``(B, 1, *S)``.
+        direction: of the last step, ``(B, D, *S)``.
+        active: which maps still move ``(B,)``.
+        best: the best maps met, ``(B, D, *S)``.
+        values: similarity of each map after each step ``(B,)``.
+        best_values: what was maximised at its best so far, after each step.
+        shortened: steps that were shortened because they would have folded, summed over the batch.
+    """
+
+    u: Tensor
+    lowest: Tensor
+    direction: Tensor
+    active: Tensor
+    best: Tensor
+    values: tuple[Tensor, ...] = ()
+    best_values: tuple[Tensor, ...] = ()
+    shortened: int = 0
+
+
+def optimise_levels(
+    problem: RegistrationProblem,
+    settings: RegistrationSettings,
+    start: Tensor | None,
+    callback: Callback | None,
+    objective: Callable[[RegistrationProblem, Grid, RegistrationSettings], Objective] | None = None,
 ) -> tuple[Tensor, tuple[LevelRecord, ...]]:
-    """Return the maps that make the images of the scene most similar, and how each level went.
+    """Return the maps that make the images of the problem most similar, and how each level went.
 
     Args:
-        scene: images on their scale.
+        problem: images on their scale.
         settings: how.
-        start: maps to begin with ``(sides·B, D, *S)`` in units of spacing, on any grid of the box; zero when None.
+        start: maps to begin with ``(B, D, *S)`` in units of spacing, on any grid of the box; zero when None.
         callback: is shown every step.
-
-    Returns:
-        u ``(sides·B, D, *S)``: with ``symmetric`` first the maps to the fixed images, then those to the moving ones.
+        objective: makes what is maximised on the grid of a level; `forward_objective` when None.
     """
-    grids = pyramid_grids(scene.grid, len(settings.steps))
-    sides = 2 if settings.symmetric else 1
-    u = scene.fixed.new_zeros(sides * scene.fixed.shape[0], scene.grid.dim, *grids[0].shape)
-    u, records = u if start is None else start.to(u), []
+    grids = pyramid_grids(problem.grid, len(settings.optimiser.steps))
+    u, records = start, []
     for index, grid in enumerate(grids):
-        level = _make_level(index, len(grids) - 1 - index, scene.on(grid), settings)
+        began = perf_counter()
+        level = make_level(problem.on(grid), settings, objective or forward_objective, index, len(grids))
+        u = level.zero if u is None else repair_folds(prolong(u, level.grid), level.grid)
         with threads_worth(len(u), grid):
-            u, record = _climb(level, mended(prolong(u, level.grid), level.grid), len(grids), callback)
-        records.append(record)
-    return mended(prolong(u, scene.grid), scene.grid), tuple(records)
+            state = optimise_level(level, u, callback)
+        u = state.best
+        records.append(LevelRecord(level.shape, state.values, state.shortened, perf_counter() - began))
+    if u is None:
+        raise InputError("register: optimiser.steps must hold one number per level")
+    return repair_folds(prolong(u, problem.grid), problem.grid), tuple(records)
 
 
-def metric_weights(grid: Grid, settings: RegistrationSettings, below: int) -> Weights:
-    """Return the weights of the metric on a level's grid that has so many finer levels below it."""
-    held = settings.weight_div / (settings.length_at(below) * grid.cell_volume ** (1 / grid.dim)) ** 2
-    return Weights(div=settings.weight_div, curl=settings.weight_curl, zero=held)
+def forward_objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
+    """Return what is maximised where the moving image is warped onto the fixed one, the map being on ``grid``."""
+    landmarks = None
+    if settings.points_weight > 0 and problem.fixed_points is not None and problem.moving_points is not None:
+        landmarks = ForwardLandmarks(problem.fixed_points, problem.moving_points, grid)
+    return Objective(forward_similarity(problem, settings), landmarks)
+
+
+def make_level(
+    problem: RegistrationProblem,
+    settings: RegistrationSettings,
+    objective: Callable[[RegistrationProblem, Grid, RegistrationSettings], Objective],
+    index: int,
+    levels: int,
+) -> Level:
+    """Return level ``index`` of so many, from the problem on its grid."""
+    grid, below = _map_grid(problem.grid, settings), levels - 1 - index
+    return Level(
+        objective=objective(problem, grid, settings),
+        metric=VelocityMetric.of(grid, settings.metric, settings.solver, problem.fixed, below),
+        settings=settings,
+        steps=steps_on(problem.grid, settings.optimiser.steps[index - levels], settings),
+        index=index,
+        levels=levels,
+        transfer=Transfer(problem.grid, grid, problem.fixed) if grid != problem.grid else None,
+    )
 
 
 def steps_on(grid: Grid, steps: int, settings: RegistrationSettings) -> int:
     """Return the steps of a level of images on this grid: a coarser map is found map_spacing² times as soon."""
-    return steps if _map_grid(grid, settings) == grid else math.ceil(steps / settings.map_spacing**2)
+    return steps if _map_grid(grid, settings) == grid else math.ceil(steps / settings.optimiser.map_spacing**2)
 
 
 def _map_grid(grid: Grid, settings: RegistrationSettings) -> Grid:
     """Return the grid that carries the map of images on ``grid``."""
-    return thinned(grid, settings.map_spacing) if math.prod(grid.shape) > _LARGE else grid
+    return thinned(grid, settings.optimiser.map_spacing) if math.prod(grid.shape) > _LARGE else grid
 
 
-def _make_level(index: int, below: int, scene: Scene, settings: RegistrationSettings) -> _Level:
-    """Return the level of a scene that is on the level's grid, with so many finer levels below it."""
-    grid, sides = _map_grid(scene.grid, settings), 2 if settings.symmetric else 1
-    compare = compare_from_middle if settings.symmetric else compare_from_fixed
-    pulls = settings.points_weight > 0
-    weights = metric_weights(grid, settings, below)
-    divergence = Row(_RESISTANCE, tuple(Term(1.0, k, k) for k in range(grid.dim)))
-    force = tuple(Row(1.0, (Term(1.0, k, None),)) for k in range(grid.dim))
-    return _Level(
-        index=index,
-        comparison=compare(scene, settings),
-        landmarks=make_landmarks(scene.fixed_points, scene.moving_points, grid, sides) if pulls else None,
-        metric=TransformSolver(grid, weights, "slip", dtype=scene.fixed.dtype, device=scene.fixed.device),
-        held=float(weights.zero),
-        controls=(divergence, *force),
-        settings=settings,
-        transfer=Transfer(scene.grid, grid, scene.fixed) if grid != scene.grid else None,
-    )
+def optimise_level(
+    level: Level, u: Tensor, callback: Callback | None = None, run: Callable[..., Any] | None = None
+) -> State:
+    """Return where the maps end, from maps u without folds.
 
-
-def _climb(level: _Level, u: Tensor, levels: int, callback: Callback | None) -> tuple[Tensor, LevelRecord]:
-    """Climb one level; every pair ends at the best maps it met."""
-    start, shortened, settings = perf_counter(), 0, level.settings
-    steps = steps_on(level.comparison.grid, settings.steps[level.index - levels], settings)
-    carried, best, values, tops = torch.zeros_like(u), u, [], []
-    top = u.new_full((len(u) // level.sides,), -torch.inf)
-    active, lowest = torch.ones_like(top, dtype=torch.bool), one_sided_determinant(u, level.grid)
-    for step in range(steps + 1):
-        warped, value, gradient = level.comparison.look(level.transfer.up(u) if level.transfer else u)
-        pull = level.landmarks.look(u) if level.landmarks else None
-        goal = value if pull is None else value - settings.points_weight * pull.distance
-        better = goal > top
-        best, top = keep(better.repeat(level.sides), u, best), keep(better, goal, top)
-        values.append(value)
-        tops.append(top)
+    Args:
+        level: what stays the same.
+        u: displacements ``(B, D, *S)`` on the grid of the level's map, in units of spacing.
+        callback: is shown every step.
+        run: calls a function with its arguments; anything that does that, such as torch's ``checkpoint``.
+    """
+    active = torch.ones(len(u), dtype=torch.bool, device=u.device)
+    state = State(u, one_sided_determinant(u, level.grid), torch.zeros_like(u), active, u)
+    for step in range(level.steps + level.keep_best):
+        state, finished = run(_step, level, state, step) if run else _step(level, state, step)
         if callback:
-            callback(Progress(level.index, levels, step, steps, value, level.comparison.grid.shape))
-        active &= ~_stalled(tops, settings.tolerance)
-        if step == steps or not bool(active.any()):
+            callback(Progress(level.index, level.levels, step, level.steps, state.values[-1], level.shape))
+        if finished:
             break
-        divergence = (settings.soft_determinant / lowest - 1).clamp_(min=0)
-        carried = _velocity(level, warped, gradient, divergence, pull) + settings.momentum * carried
-        v = in_voxels(carried, level.grid)
-        del warped, gradient  # before the next are made
-        pace = step_length(settings, step, steps) / level.sides
-        move = v * per_item((_pace(pace, v, pull, level) * active).repeat(level.sides), v)
-        share = (settings.elasticity * active).repeat(level.sides)
-        u, lowest, moved, short = advance((u, lowest), move, share, level.grid, settings.min_determinant, level.sides)
-        active &= moved
-        shortened += short
-    return best, LevelRecord(level.comparison.grid.shape, tuple(values), shortened, perf_counter() - start)
+    return state
 
 
-def _stalled(tops: list[Tensor], tolerance: float) -> Tensor:
-    """True for the pairs whose last steps raised the best similarity by too small a share of the whole rise."""
-    if len(tops) <= _PATIENCE:
-        return torch.zeros_like(tops[0], dtype=torch.bool)
-    return tops[-1] - tops[-1 - _PATIENCE] <= tolerance * (tops[-1] - tops[0])
-
-
-def _velocity(level: _Level, warped: Tensor, gradient: Tensor, divergence: Tensor, pull: Pull | None) -> Tensor:
-    """Return the velocity that least squares find for the forces and the divergence, its longest move being one voxel.
-
-    The force is scaled to 1 at its strongest, so the divergence needs no unit of similarity. That of the landmarks is
-    smoothed by one power more, w_0 (M⁻¹K)⁻¹, which keeps its sum: what least squares alone answer to a point, a
-    logarithm in 2D and 1/r in 3D, has a peak there. Two maps of a pair move against each other.
-    """
-    grid = level.grid
-    force = image_force(gradient, warped, level.comparison.grid)
-    force = level.transfer.gather(force) if level.transfer else force
-    points = None if pull is None else pull.load(grid) * (level.settings.points_weight * math.prod(grid.shape))
-    strongest = strongest_of(force) if points is None else strongest_of(force).maximum(strongest_of(points))
-    scale = 1 / strongest.clamp(min=torch.finfo(force.dtype).tiny)
-    load = assemble_load(level.controls, torch.cat([divergence, force * per_item(scale, force)], dim=1), grid)
-    v = level.metric.solve(load, power=level.settings.power)
+def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
+    """Return the state after one step, and whether it was the last."""
+    settings, objective, grid = level.settings, level.objective, level.grid
+    # 1. Evaluate: warp the images, compare them, and see how far the landmarks are apart.
+    at_images = state.u if level.transfer is None else level.transfer.up(state.u)
+    warped, value, slope = objective.similarity.evaluate(at_images)
+    points = objective.landmarks.evaluate(state.u) if objective.landmarks else None
+    del at_images
+    state = _judged(level, state, value, None if points is None else points.distance)
+    if level.keep_best and (step == level.steps or not bool(state.active.any())):
+        return state, True
+    # 2. Force: steepest ascent of the similarity asks for N ∂S/∂warped ∇warped, the landmarks pull at their points.
+    force = image_force(slope, warped, objective.similarity.grid, settings.stencil)
+    del warped, slope  # before the next are made
+    force = force if level.transfer is None else level.transfer.gather(force)
+    load = None if points is None else points.load(grid) * points_scale(settings.points_weight, grid)
+    # 3. Least squares: div and curl of the velocity are paid for, nearly folded places ask for divergence.
+    barrier = fold_barrier(state.lowest, settings.folds.soft_determinant)
+    v = normalise_step(objective.coupling.velocity(level.metric.ascent(force, barrier, load)), grid)
+    direction = v + settings.optimiser.momentum * state.direction
+    v = normalise_step(direction, grid)
+    # 4. and 5. Flow and guard: φ ← φ ∘ flow(v), no farther than where a determinant becomes too small.
+    size = v.new_full((len(v),), step_size(settings.optimiser, step, level.steps))
     if points is not None:
-        load = points * per_item(scale * (grid.cell_volume * level.held), points)
-        v = v + level.metric.solve(load, power=level.settings.power + 1)
-    if level.sides == 2:
-        v = v - v.roll(len(v) // 2, 0)
-    return in_voxels(v, grid)
+        size = points.line_search(v, grid).clamp(min=LAST_STEP * size, max=size)
+    moved, u, lowest = fold_free_step(level, state, v * per_item(size * state.active, v))
+    shortened = state.shortened + int((moved < 1).sum())
+    active = state.active & (moved > 0)
+    return replace(state, u=u, lowest=lowest, direction=direction, active=active, shortened=shortened), False
 
 
-def in_voxels(v: Tensor, grid: Grid) -> Tensor:
-    """Return the velocity ``(B, D, *S)`` on the scale on which its longest move is one voxel; 0 stays 0."""
-    longest = strongest_of(v / grid.along(grid.spacing, v))
-    return v / per_item(longest.clamp(min=torch.finfo(v.dtype).tiny), v)
+def fold_free_step(level: Level, state: State, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return which share of the step every map made, u ∘ flow(share v) smoothed elastically, and its determinants.
 
-
-def step_length(settings: RegistrationSettings, step: int, steps: int) -> float:
-    """Return the longest move in voxels in this step of so many, from 0."""
-    return settings.step_length * (1 - (1 - _LAST_STEP) * step / steps)
-
-
-def image_force(gradient: Tensor, warped: Tensor, grid: Grid) -> Tensor:
-    """Return Σ_c gradient_c ∇warped_c ``(B, D, *S)`` from N ∂S/∂warped and the warped image, both ``(B, C, *S)``."""
-    return torch.cat([(gradient * derivative(warped, grid, a)).sum(1, keepdim=True) for a in range(grid.dim)], dim=1)
-
-
-def strongest_of(force: Tensor) -> Tensor:
-    """Return the largest |force| of each item ``(B,)``."""
-    return force.square().sum(1).flatten(1).amax(1).sqrt()
-
-
-def _pace(pace: float, v: Tensor, pull: Pull | None, level: _Level) -> Tensor:
-    """Return how far to go in voxels ``(B,)``: no farther than where the landmarks are nearest to each other."""
-    full = v.new_full((len(v) // level.sides,), pace)
-    return full if pull is None else pull.reach(v, level.grid).clamp(min=_LAST_STEP * pace, max=pace)
-
-
-def compare_from_fixed(scene: Scene, settings: RegistrationSettings) -> Comparison:
-    """Return the comparison in which the moving image is warped."""
-    fixed, moving = (features(settings.similarity, image) for image in (scene.fixed, scene.moving))
-    similarity = make_similarity(settings.similarity, fixed, settings.window, grid=scene.grid)
-    return Comparison(scene.grid, moving, similarity, scene.moving_mask, scene.fixed_mask)
-
-
-def compare_from_middle(scene: Scene, settings: RegistrationSettings) -> Comparison:
-    """Return the comparison in which both images are warped."""
-    images = torch.cat([features(settings.similarity, image) for image in (scene.fixed, scene.moving)])
-    masks = None
-    if scene.fixed_mask is not None or scene.moving_mask is not None:
-        ones = torch.ones_like(scene.fixed[:, :1])
-        masks = torch.cat([ones if mask is None else mask for mask in (scene.fixed_mask, scene.moving_mask)])
-    return Comparison(scene.grid, images, _MutualSimilarity(settings, scene.grid), masks, sides=2)
-
-
-class _MutualSimilarity(Similarity):
-    """(S(a, b) + S(b, a)) / 2 for images a and b of which both are warped.
-
-    ``evaluate`` takes first all a, then all b, ``(2B, C, *S)``. It returns S per pair ``(B,)``, and the derivative of
-    S(b, a) by a and of S(a, b) by b. Nothing changes when a and b change places, except the places.
+    No one-sided determinant falls below ``min_determinant``, or below the smallest one there was if that was less. As
+    the step is halved the trial tends to u, so a bold step ends as a short one. The extrapolated determinants on the
+    faces of the box are left to `repair_folds`, after the last step: they take as long as all the others and hardly
+    ever fold alone.
     """
+    settings, grid = level.settings, level.grid
+    floor = state.lowest.flatten(1).amin(1).clamp(max=settings.folds.min_determinant)
+    u, lowest = state.u, state.lowest
 
-    def __init__(self, settings: RegistrationSettings, grid: Grid) -> None:
-        self.settings, self.grid = settings, grid
+    def accept(share: Tensor) -> Tensor:
+        nonlocal u, lowest
+        u = compose(state.u, flow(v * per_item(share, v), grid, settings.flow), grid)
+        if settings.metric.elasticity > 0:
+            u = smooth_elastically(u, settings.metric.elasticity * share * state.active, grid)
+        lowest = one_sided_determinant(u, grid)
+        return level.objective.coupling.all(lowest.flatten(1).amin(1) >= floor)
 
-    def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        others = _of_other_side(warped)
-        similarity = make_similarity(self.settings.similarity, others, self.settings.window, grid=self.grid)
-        value, slope = similarity.evaluate(warped, mask)
-        return torch.stack(value.chunk(2)).mean(0), slope
+    share = largest_share(accept, floor, halvings=_HALVINGS)
+    good = share > 0
+    return share, where_items(good, u, state.u), where_items(good, lowest, state.lowest)
 
 
-def _of_other_side(both: Tensor) -> Tensor:
-    return both.roll(len(both) // 2, 0)
+def _judged(level: Level, state: State, value: Tensor, distance: Tensor | None) -> State:
+    """Return the state with the best maps so far, and without the maps that gain no more."""
+    if not level.keep_best:
+        return replace(state, values=(*state.values, value.detach()))
+    goal = value if distance is None else value - level.settings.points_weight * distance
+    top = state.best_values[-1] if state.best_values else torch.full_like(goal, -torch.inf)
+    better = goal > top
+    best, top = where_items(better, state.u, state.best), where_items(better, goal, top)
+    best_values = (*state.best_values, top)
+    active = state.active & ~_stalled(best_values, level.settings.optimiser.tolerance)
+    return replace(state, best=best, values=(*state.values, value), best_values=best_values, active=active)
+
+
+def _stalled(best_values: tuple[Tensor, ...], tolerance: float) -> Tensor:
+    """True for the maps whose last steps raised the best value by too small a share of the whole rise."""
+    if len(best_values) <= _PATIENCE:
+        return torch.zeros_like(best_values[0], dtype=torch.bool)
+    return best_values[-1] - best_values[-1 - _PATIENCE] <= tolerance * (best_values[-1] - best_values[0])

@@ -12,7 +12,7 @@ from torchdeform.core.intensities import corresponding_channels, fill, to_common
 from torchdeform.core.resampling import restrict
 from torchdeform.core.transform import Affine
 from torchdeform.errors import InputError
-from torchdeform.metrics.similarity import on_one_scale
+from torchdeform.metrics.similarity import needs_common_scale
 from torchdeform.registration.settings import RegistrationSettings
 
 
@@ -92,7 +92,7 @@ class Guidance:
 
 
 @dataclass(frozen=True)
-class Scene:
+class RegistrationProblem:
     """Two images on one grid and what is known about them.
 
     Attributes:
@@ -113,8 +113,8 @@ class Scene:
     fixed_points: Tensor | None = None
     moving_points: Tensor | None = None
 
-    def on(self, coarse: Grid) -> "Scene":
-        """Return the scene on a coarser grid of the same box."""
+    def on(self, coarse: Grid) -> "RegistrationProblem":
+        """Return the problem on a coarser grid of the same box."""
 
         def coarser(field: Tensor | None) -> Tensor | None:
             return None if field is None else restrict(field, self.grid, coarse)
@@ -123,22 +123,22 @@ class Scene:
         images = {"fixed": restrict(self.fixed, self.grid, coarse), "moving": restrict(self.moving, self.grid, coarse)}
         return replace(self, grid=coarse, **images, **masks)
 
-    def scaled(self, settings: RegistrationSettings) -> "Scene":
-        """Return the scene with intensities on the scale that the similarity needs."""
+    def scaled(self, settings: RegistrationSettings) -> "RegistrationProblem":
+        """Return the problem with intensities on the scale that the similarity needs."""
         images = to_common_scale(
             (self.fixed, self.moving),
             (self.fixed_mask, self.moving_mask),
-            jointly=on_one_scale(settings.similarity),
+            jointly=needs_common_scale(settings.similarity.measure),
         )
         return replace(self, fixed=images[0], moving=images[1])
 
 
-def tensor_scene(fixed: Tensor, moving: Tensor, grid: Grid, guidance: Guidance) -> Scene:
-    """Return the scene of two tensors on one grid, filled in where the masks are 0."""
+def problem_of_tensors(fixed: Tensor, moving: Tensor, grid: Grid, guidance: Guidance) -> RegistrationProblem:
+    """Return the problem of two tensors on one grid, filled in where the masks are 0."""
     masks = [_weights(mask, fixed) for mask in (guidance.fixed_mask, guidance.moving_mask)]
     images = [image if mask is None else fill(image, mask) for image, mask in zip((fixed, moving), masks, strict=True)]
     points = [None if p is None else p.to(fixed) for p in (guidance.fixed_points, guidance.moving_points)]
-    return Scene(grid, *images, *masks, *points)
+    return RegistrationProblem(grid, *images, *masks, *points)
 
 
 def _weights(mask: object, like: Tensor) -> Tensor | None:
@@ -146,7 +146,7 @@ def _weights(mask: object, like: Tensor) -> Tensor | None:
 
 
 @dataclass(frozen=True)
-class Subject:
+class PlacedImage:
     """One of the two images as it is compared, in its own place.
 
     Attributes:
@@ -159,11 +159,11 @@ class Subject:
     mask: Image | None
     points: Tensor | None
 
-    def moved(self, affine: Affine) -> "Subject":
-        """Return the subject at the place where an affine map of the world takes it."""
+    def moved(self, affine: Affine) -> "PlacedImage":
+        """Return the image, its mask and its points at the place where an affine map of the world takes it."""
         mask = None if self.mask is None else moved(self.mask, affine)
         points = None if self.points is None else affine(self.points)
-        return Subject(moved(self.image, affine), mask, points)
+        return PlacedImage(moved(self.image, affine), mask, points)
 
 
 def moved(image: Image, affine: Affine) -> Image:
@@ -177,31 +177,31 @@ def moved(image: Image, affine: Affine) -> Image:
     )
 
 
-def subjects(fixed: Image, moving: Image, guidance: Guidance) -> tuple[Subject, Subject]:
+def placed_images(fixed: Image, moving: Image, guidance: Guidance) -> tuple[PlacedImage, PlacedImage]:
     """Return both images as they are compared.
 
     Raises:
         InputError: channels that do not correspond, masks that are empty, pixels that count but are NaN or all equal.
     """
     images = corresponding_channels(fixed, moving)
-    first = _subject(images[0], guidance.fixed_mask, guidance.fixed_points)
-    return first, _subject(images[1], guidance.moving_mask, guidance.moving_points)
+    first = _placed(images[0], guidance.fixed_mask, guidance.fixed_points)
+    return first, _placed(images[1], guidance.moving_mask, guidance.moving_points)
 
 
-def _subject(image: Image, mask: Tensor | Image | None, points: Tensor | None) -> Subject:
+def _placed(image: Image, mask: Tensor | Image | None, points: Tensor | None) -> PlacedImage:
     points = None if points is None else points.double().to(image.data.device)
     if not isinstance(mask, Image):
         require_registrable(image)
-        return Subject(image, None, points)
+        return PlacedImage(image, None, points)
     inside = resample(replace(mask, data=(mask.data != 0).to(image.data)), image, mode="nearest")
     require_mask(inside, mask.name)
     image = replace(image, data=fill(image.data, inside))
     require_registrable(image)
-    return Subject(image, replace(image, data=inside), points)
+    return PlacedImage(image, replace(image, data=inside), points)
 
 
-def place(fixed: Subject, moving: Subject, frame: Image) -> Scene:
-    """Return the scene of both images sampled on the grid of ``frame``, each where it is in the world.
+def resample_pair(fixed: PlacedImage, moving: PlacedImage, frame: Image) -> RegistrationProblem:
+    """Return the problem of both images sampled on the grid of ``frame``, each where it is in the world.
 
     An image that does not cover the frame has a mask there whether it came with one or not: beyond its edges there is
     nothing to compare.
@@ -210,12 +210,14 @@ def place(fixed: Subject, moving: Subject, frame: Image) -> Scene:
     images = [resample(s.image, frame, outside=None).to(like) for s in (fixed, moving)]
     masks = [_mask_on(frame, s) for s in (fixed, moving)]
     points = [None if s.points is None else frame.to_grid(s.points).to(like) for s in (fixed, moving)]
-    return Scene(frame.grid, *images, *(None if mask is None else mask.to(like) for mask in masks), *points)
+    return RegistrationProblem(
+        frame.grid, *images, *(None if mask is None else mask.to(like) for mask in masks), *points
+    )
 
 
-def _mask_on(frame: Image, subject: Subject) -> Tensor | None:
-    """Return the weights of a subject on the frame, None if they are 1 everywhere."""
-    image, mask = subject.image, subject.mask
+def _mask_on(frame: Image, placed: PlacedImage) -> Tensor | None:
+    """Return the weights of an image on the frame, None if they are 1 everywhere."""
+    image, mask = placed.image, placed.mask
     if mask is None and same_place(image, frame):
         return None
     mask = replace(image, data=torch.ones_like(image.data[:, :1])) if mask is None else mask

@@ -1,38 +1,97 @@
-"""Settings of a registration: typed, frozen, checked when made."""
+"""Settings of a registration, nested by subject: typed, frozen, checked when made."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from torchdeform.core.flow import OdeSolver
 from torchdeform.errors import InputError, require_choice
+from torchdeform.fem.solver import SolverSettings
 from torchdeform.metrics.similarity import similarity_weights
+from torchdeform.registration.affine.settings import AlignmentSettings
 
-ALIGNMENTS = ("none", "translation", "rigid", "similarity", "affine")
 STARTS = ("identity", "discrete")
+STENCILS = ("auto", "convolution", "shifts")
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegistrationSettings:
-    """Everything that can be chosen; the defaults are the preset ``default``.
+class SimilaritySettings:
+    """What is compared, and how.
 
     Args:
-        align: how images (not tensors) are aligned first: ``none``, ``translation``, ``rigid``, ``similarity`` or
-            ``affine``, see `align`.
-        start: map to begin with: ``identity``, or ``discrete`` for one from a search over large displacements, see
-            `discrete_start`.
-        similarity: ``lncc`` (squared local normalised cross-correlation, for images of one contrast with different
+        measure: ``lncc`` (squared local normalised cross-correlation, for images of one contrast with different
             brightness), ``ncc`` (the correlation of whole images), ``ssd`` (mean squared difference, for images on the
             same intensity scale); for images of different contrast ``mi`` and ``nmi`` (mutual information, normalised),
             ``ngf`` (directions of the gradients), ``mind`` (self-similarity of patches). Or several of them with
             positive weights, as ``{lncc: 1, mi: 0.5}``.
         window: width of the LNCC window in voxels, odd.
-        weight_div: price w_d of a change of volume in the metric; large keeps volumes.
-        weight_curl: price w_c of a rotation.
-        length: range √(w_d / w_0) of the metric in voxels of each level's map; longer makes the velocity smoother. One
-            number, or one for each level, coarse to fine: the last is for the finest, the first for all not named.
-        elasticity: share of the way to the mean of its neighbours, 0 to 1, that the displacement of every node of the
-            map is taken in every step: `length` smooths each step, this the whole; larger is smoother.
-        power: 1, or 2 for a smoother velocity, see `TransformSolver.solve`.
+
+    Raises:
+        InputError: a value out of range, named.
+    """
+
+    measure: str | Mapping[str, float] = "lncc"
+    window: int = 9
+
+    def __post_init__(self) -> None:
+        similarity_weights(self.measure)
+        if not isinstance(self.measure, str):  # a copy of our own, and a dict, which `asdict` can take
+            object.__setattr__(self, "measure", dict(self.measure))
+        if self.window < 3 or self.window % 2 == 0:
+            raise InputError(f"similarity.window must be an odd number of voxels, at least 3, got {self.window}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricSettings:
+    """What a velocity costs, and how smooth the map is: ∫ w_div (div v)² + w_curl |curl v|² + w_zero |v|².
+
+    Args:
+        weight_div: price w_div of a change of volume; large keeps volumes.
+        weight_curl: price w_curl of a rotation.
+        length_scale: √(w_div / w_zero) in voxels of each level's map, beyond which a velocity decays; longer makes it
+            smoother. One number, or one for each level, coarse to fine: the last is for the finest, the first for all
+            not named.
+        order: 1, or 2 for a smoother velocity (K M⁻¹ K in place of K).
+        elasticity: smoothing of the map in each step, 0 none, 1 full: the share of the way to the mean of its
+            neighbours that every node is moved.
+
+    Raises:
+        InputError: a value out of range, named.
+    """
+
+    weight_div: float = 0.5
+    weight_curl: float = 1.0
+    length_scale: float | tuple[float, ...] = (8.0, 5.0, 2.5)
+    order: int = 1
+    elasticity: float = 0.2
+
+    def __post_init__(self) -> None:
+        lengths = self._lengths
+        if not lengths or not all(0 < length < math.inf for length in lengths):
+            wanted = "positive and finite, one number or one for each level"
+            raise InputError(f"metric.length_scale must be {wanted}, got {self.length_scale}")
+        for name in ("weight_div", "weight_curl"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"metric.{name} must be positive and finite, got {getattr(self, name)}")
+        if self.order not in (1, 2):
+            raise InputError(f"metric.order must be 1 or 2, got {self.order}")
+        if not 0 <= self.elasticity <= 1:
+            raise InputError(f"metric.elasticity must lie between 0 and 1, got {self.elasticity}")
+
+    @property
+    def _lengths(self) -> tuple[float, ...]:
+        return (self.length_scale,) if isinstance(self.length_scale, int | float) else tuple(self.length_scale)
+
+    def length_at(self, below: int) -> float:
+        """Return the length scale for a level that has so many finer ones below it."""
+        return self._lengths[max(len(self._lengths) - 1 - below, 0)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptimiserSettings:
+    """How far and how often the maps move.
+
+    Args:
         steps: steps at most on each pyramid level, coarse to fine; its length is the number of levels (a level that
             would leave fewer than 16 nodes on every axis is dropped).
         step_length: longest move in one step, in voxels of the map; falls linearly to a tenth of this over a level.
@@ -41,9 +100,135 @@ class RegistrationSettings:
         tolerance: a level stops when 5 steps raised the best similarity by less than this share of its rise so far.
         map_spacing: spacing of the grid that carries the map, in voxels of the level's images, on levels of more than
             2^17 voxels, which take map_spacing² times fewer steps; smaller ones carry it at every voxel.
+
+    Raises:
+        InputError: a value out of range, named.
+    """
+
+    steps: tuple[int, ...] = (40, 30, 24)
+    step_length: float = 1.0
+    momentum: float = 0.5
+    tolerance: float = 0.03
+    map_spacing: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not self.steps or min(self.steps) < 0:
+            raise InputError(f"optimiser.steps must hold one number per level, none negative, got {self.steps}")
+        if not 0 < self.step_length < math.inf:
+            raise InputError(f"optimiser.step_length must be positive and finite, got {self.step_length}")
+        if not 0 <= self.momentum < 1:
+            raise InputError(f"optimiser.momentum must be at least 0 and below 1, got {self.momentum}")
+        if not 0 <= self.tolerance < math.inf:
+            raise InputError(f"optimiser.tolerance must be finite and not negative, got {self.tolerance}")
+        if not 1 <= self.map_spacing <= 8:
+            raise InputError(f"optimiser.map_spacing must lie between 1 and 8 voxels, got {self.map_spacing}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoldSettings:
+    """How folds are kept away.
+
+    Args:
         soft_determinant: where a one-sided determinant J is smaller than this, a divergence proportional to
             soft_determinant/J − 1 is asked for, which opens the grid up again; 0 switches it off.
         min_determinant: smallest one-sided determinant that a step may leave; a step that would go below is shortened.
+
+    Raises:
+        InputError: a value out of range, named.
+    """
+
+    soft_determinant: float = 0.15
+    min_determinant: float = 0.03
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.soft_determinant < math.inf:
+            raise InputError(f"folds.soft_determinant must be finite and not negative, got {self.soft_determinant}")
+        if not 0 < self.min_determinant < 1:
+            raise InputError(f"folds.min_determinant must lie between 0 and 1, got {self.min_determinant}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiscreteSettings:
+    """How far and how finely `discrete_start` searches, and how smooth its result is.
+
+    Args:
+        levels: pyramid levels to search on, coarse to fine, 0 being the images' own: displacements on level l are
+            multiples of 2^l voxels.
+        reach: longest displacement along an axis tried on each of them, in voxels of the images. A later level
+            corrects the ones before.
+        spacing: distance of the control points in displacements of one step, at least 1.
+        smoothing: standard deviation of the Gaussian that the field is smoothed with, in control points.
+        coupling: prices of a squared step between a control point and the smooth field, in standard deviations of the
+            matching cost; they rise from the first round to the last, and with them the agreement of neighbours.
+        symmetric: match moving to fixed as well, and keep what both directions agree on; takes twice as long.
+        length_scale: range of the metric in which the flow is fitted to the matches, in control points.
+        min_determinant: smallest one-sided determinant of the result.
+
+    Raises:
+        InputError: a value out of range, named.
+    """
+
+    levels: tuple[int, ...] = (2, 1)
+    reach: tuple[float, ...] = (20.0, 6.0)
+    spacing: float = 2.0
+    smoothing: float = 1.5
+    coupling: tuple[float, ...] = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
+    symmetric: bool = True
+    length_scale: float = 2.0
+    min_determinant: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not self.levels or len(self.levels) != len(self.reach):
+            both = f"{self.levels}, {self.reach}"
+            raise InputError(f"discrete.levels and discrete.reach must have one entry each per level, got {both}")
+        if min(self.levels) < 0 or list(self.levels) != sorted(self.levels, reverse=True):
+            raise InputError(f"discrete.levels must not be negative and run from coarse to fine, got {self.levels}")
+        if not self.coupling:
+            raise InputError("discrete.coupling must have at least one price")
+        positive = {"reach": self.reach, "coupling": self.coupling}
+        positive |= {name: (getattr(self, name),) for name in ("smoothing", "length_scale", "min_determinant")}
+        for name, values in positive.items():
+            if not all(0 < value < math.inf for value in values):
+                raise InputError(f"discrete.{name} must be positive and finite, got {getattr(self, name)}")
+        if not 1 <= self.spacing < math.inf:
+            raise InputError(f"discrete.spacing must be at least 1, got {self.spacing}")
+        if self.min_determinant >= 1:
+            raise InputError(f"discrete.min_determinant must be below 1, got {self.min_determinant}")
+
+
+_ALIGN, _DISCRETE, _SIMILARITY, _METRIC = (
+    AlignmentSettings(),
+    DiscreteSettings(),
+    SimilaritySettings(),
+    MetricSettings(),
+)
+_SOLVER, _FLOW = SolverSettings(), OdeSolver(method="midpoint", steps=1)
+_OPTIMISER, _FOLDS = OptimiserSettings(), FoldSettings()
+
+# A group that is given as one value gives this field of it: ``solver: cg`` is ``solver: {method: cg}``.
+SHORT_FORMS = {"align": "kind", "similarity": "measure", "solver": "method", "flow": "method"}
+_SHORT_DEFAULTS = {"align": _ALIGN, "similarity": _SIMILARITY, "solver": _SOLVER, "flow": _FLOW}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationSettings:
+    """Everything that can be chosen; the defaults are the preset ``default``.
+
+    Args:
+        align: how images (not tensors) are aligned first; as one value its ``kind``: ``none``, ``translation``,
+            ``rigid``, ``similarity`` or ``affine``.
+        start: map to begin with: ``identity``, or ``discrete`` for one from a search over large displacements, see
+            `discrete_start`.
+        discrete: settings of that search.
+        similarity: what is compared; as one value its ``measure``.
+        metric: what a velocity costs.
+        solver: how the least squares for the velocity are solved; as one value its ``method``: ``auto``,
+            ``transform``, ``cg`` or ``assembled``.
+        flow: how the velocity is integrated; as one value its ``method``.
+        optimiser: steps and when to stop.
+        folds: how folds are kept away.
+        stencil: how differences of images are computed: ``convolution``, ``shifts`` (sums of shifted images), or
+            ``auto``, whichever is faster; the values are the same.
         points_weight: what landmarks weigh against the similarity: the mean of |φ(p) − q|² over the pairs, in squared
             units of spacing (mm² for images), is multiplied by this and taken off; 0 only measures them.
         symmetric: prefer neither image: both are warped into a space between, so that swapping them inverts the map.
@@ -52,58 +237,25 @@ class RegistrationSettings:
         InputError: a value out of range, named.
     """
 
-    align: str = "affine"
+    align: AlignmentSettings = _ALIGN
     start: str = "identity"
-    similarity: str | Mapping[str, float] = "lncc"
-    window: int = 9
-    weight_div: float = 0.5
-    weight_curl: float = 1.0
-    length: float | tuple[float, ...] = (8.0, 5.0, 2.5)
-    elasticity: float = 0.2
-    power: int = 1
-    steps: tuple[int, ...] = (40, 30, 24)
-    step_length: float = 1.0
-    momentum: float = 0.5
-    tolerance: float = 0.03
-    map_spacing: float = 2.0
-    soft_determinant: float = 0.15
-    min_determinant: float = 0.03
+    discrete: DiscreteSettings = _DISCRETE
+    similarity: SimilaritySettings = _SIMILARITY
+    metric: MetricSettings = _METRIC
+    solver: SolverSettings = _SOLVER
+    flow: OdeSolver = _FLOW
+    optimiser: OptimiserSettings = _OPTIMISER
+    folds: FoldSettings = _FOLDS
+    stencil: str = "auto"
     points_weight: float = 0.0
     symmetric: bool = False
 
     def __post_init__(self) -> None:
-        require_choice(self.align, ALIGNMENTS, "align")
+        for name, key in SHORT_FORMS.items():
+            value = getattr(self, name)
+            if isinstance(value, str | Mapping):
+                object.__setattr__(self, name, replace(_SHORT_DEFAULTS[name], **{key: value}))
         require_choice(self.start, STARTS, "start")
-        similarity_weights(self.similarity)
-        if not isinstance(self.similarity, str):  # a copy of our own, and a dict, which `asdict` can take
-            object.__setattr__(self, "similarity", dict(self.similarity))
-        if self.window < 3 or self.window % 2 == 0:
-            raise InputError(f"window must be an odd number of voxels, at least 3, got {self.window}")
-        if not self.steps or min(self.steps) < 0:
-            raise InputError(f"steps must hold one number per level, none negative, got {self.steps}")
-        if self.power not in (1, 2):
-            raise InputError(f"power must be 1 or 2, got {self.power}")
-        if not 0 < self.min_determinant < 1:
-            raise InputError(f"min_determinant must lie between 0 and 1, got {self.min_determinant}")
-        if not self._lengths or not all(0 < length < math.inf for length in self._lengths):
-            raise InputError(f"length must be positive and finite, one number or one for each level, got {self.length}")
-        for name in ("weight_div", "weight_curl", "step_length"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"{name} must be positive and finite, got {getattr(self, name)}")
-        if not 0 <= self.elasticity <= 1:
-            raise InputError(f"elasticity must lie between 0 and 1, got {self.elasticity}")
-        if not 0 <= self.momentum < 1:
-            raise InputError(f"momentum must be at least 0 and below 1, got {self.momentum}")
-        if not 1 <= self.map_spacing <= 8:
-            raise InputError(f"map_spacing must lie between 1 and 8 voxels, got {self.map_spacing}")
-        for name in ("soft_determinant", "tolerance", "points_weight"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"{name} must be finite and not negative, got {getattr(self, name)}")
-
-    @property
-    def _lengths(self) -> tuple[float, ...]:
-        return (self.length,) if isinstance(self.length, int | float) else tuple(self.length)
-
-    def length_at(self, below: int) -> float:
-        """Return the length for a level that has so many finer ones below it."""
-        return self._lengths[max(len(self._lengths) - 1 - below, 0)]
+        require_choice(self.stencil, STENCILS, "stencil")
+        if not 0 <= self.points_weight < math.inf:
+            raise InputError(f"points_weight must be finite and not negative, got {self.points_weight}")

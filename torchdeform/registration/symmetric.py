@@ -1,4 +1,9 @@
-"""Registration that does not prefer an image: both are warped into a space between, φ = φ_m ∘ φ_f⁻¹."""
+"""Registration that does not prefer an image: both are warped into a space between, φ = φ_m ∘ φ_f⁻¹.
+
+The loop sees a batch of twice as many maps, first those to the fixed images, then those to the moving ones. What makes
+them pairs is here: a similarity of both, velocities projected to those that move the two against each other, and steps
+of half the length that both make or neither.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -6,17 +11,20 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchdeform.core.fold_free import mended
+from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid, over_slabs
 from torchdeform.core.image import Image
 from torchdeform.core.resampling import MIN_NODES
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import compose, invert, sample
 from torchdeform.errors import InputError
-from torchdeform.registration.optimise import climb_levels
-from torchdeform.registration.problem import Scene, Subject, place
+from torchdeform.metrics.base import Similarity
+from torchdeform.metrics.similarity import features, make_similarity
+from torchdeform.registration.landmarks import MidspaceLandmarks
+from torchdeform.registration.optimise import Coupling, Objective, SimilarityTerm, optimise_levels
+from torchdeform.registration.problem import PlacedImage, RegistrationProblem, resample_pair
 from torchdeform.registration.result import Callback, LevelRecord
-from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.settings import RegistrationSettings, SimilaritySettings
 
 Direction = tuple[tuple[float, ...], ...]
 
@@ -28,60 +36,118 @@ _ROOT_STEPS = 60
 
 
 @dataclass(frozen=True)
-class Middle:
+class MidSpace:
     """The space between two images.
 
     Attributes:
-        scene: both images there, with their masks and landmarks.
-        from_fixed: takes grid points of the fixed grid to grid points of the scene.
+        problem: both images there, with their masks and landmarks.
+        from_fixed: takes grid points of the fixed grid to grid points of the problem.
         to_fixed: the inverse.
     """
 
-    scene: Scene
+    problem: RegistrationProblem
     from_fixed: Callable[[Tensor], Tensor]
     to_fixed: Callable[[Tensor], Tensor]
 
 
-def climb_from_middle(
-    middle: Middle, grid: Grid, settings: RegistrationSettings, start: Tensor | None, callback: Callback | None
+def optimise_symmetric(
+    space: MidSpace, grid: Grid, settings: RegistrationSettings, start: Tensor | None, callback: Callback | None
 ) -> tuple[Tensor, tuple[LevelRecord, ...]]:
     """Return the displacement of φ = φ_m ∘ φ_f⁻¹ on the fixed grid, and how each level went.
 
     Args:
-        middle: the images.
+        space: the images.
         grid: the fixed grid.
         settings: how.
         start: displacement ``(B, D, *S)`` on the fixed grid to begin with; zero when None.
         callback: is shown every step.
     """
-    inner = middle.scene.grid
-    halves = None if start is None else _split(_start_between(start, grid, middle), inner)
-    halves, records = climb_levels(middle.scene, _half(settings), halves, callback)
+    inner, items = space.problem.grid, len(space.problem.fixed)
+    halves = None if start is None else _split(_start_in(space, start, grid), inner)
+    shown = None if callback is None else lambda step: callback(replace(step, similarity=step.similarity[:items]))
+    halves, records = optimise_levels(space.problem, _of_half(settings), halves, shown, symmetric_objective)
     to_fixed, to_moving = halves.chunk(2)
     inverse = invert(to_fixed, inner)
 
     def joined(rows: slice) -> Tensor:
         nodes = grid.points(dtype=torch.float64, device=halves.device, rows=rows)
-        points = middle.from_fixed(nodes)
+        points = space.from_fixed(nodes)
         points = points + sample(inverse, points, inner)
         points = points + sample(to_moving, points, inner)
-        return (middle.to_fixed(points) - nodes).to(halves)
+        return (space.to_fixed(points) - nodes).to(halves)
 
     u = over_slabs(joined, grid.shape, halves.device)
-    return mended(u, grid, settings.min_determinant), records
+    return repair_folds(u, grid, settings.folds.min_determinant), tuple(_of_pairs(one, items) for one in records)
 
 
-def _half(settings: RegistrationSettings) -> RegistrationSettings:
-    """Return the settings of either half: two maps with √J each make one with J."""
-    low, soft = settings.min_determinant**0.5, settings.soft_determinant**0.5
-    return replace(settings, min_determinant=low, soft_determinant=soft)
+def _of_half(settings: RegistrationSettings) -> RegistrationSettings:
+    """Return the settings of either half: two maps with √J each make one with J, and both make half of a step."""
+    folds, optimiser = settings.folds, settings.optimiser
+    low, soft = folds.min_determinant**0.5, folds.soft_determinant**0.5
+    return replace(
+        settings,
+        folds=replace(folds, min_determinant=low, soft_determinant=soft),
+        optimiser=replace(optimiser, step_length=optimiser.step_length / 2),
+    )
 
 
-def _start_between(u: Tensor, grid: Grid, middle: Middle) -> Tensor:
-    """Return the displacement that does in the middle space what u does in the fixed one."""
-    nodes = middle.scene.grid.points(dtype=torch.float64, device=u.device)
-    points = middle.to_fixed(nodes)
-    return (middle.from_fixed(points + sample(u, points, grid)) - nodes).to(u)
+def _of_pairs(record: LevelRecord, items: int) -> LevelRecord:
+    """Return the record of the pairs from that of their maps, of which both are shortened together."""
+    return replace(record, similarity=tuple(v[:items] for v in record.similarity), shortened=record.shortened // 2)
+
+
+def symmetric_objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
+    """Return what is maximised where both images are warped into a space between, the maps being on ``grid``."""
+    measure = settings.similarity.measure
+    images = torch.cat([features(measure, image) for image in (problem.fixed, problem.moving)])
+    masks = None
+    if problem.fixed_mask is not None or problem.moving_mask is not None:
+        ones = torch.ones_like(problem.fixed[:, :1])
+        masks = torch.cat([ones if mask is None else mask for mask in (problem.fixed_mask, problem.moving_mask)])
+    term = SimilarityTerm(problem.grid, images, _MutualSimilarity(settings.similarity, problem.grid), masks)
+    landmarks = None
+    if settings.points_weight > 0 and problem.fixed_points is not None and problem.moving_points is not None:
+        landmarks = MidspaceLandmarks(problem.fixed_points, problem.moving_points, grid)
+    return Objective(term, landmarks, _Opposed())
+
+
+class _Opposed(Coupling):
+    """The two maps of a pair, half a batch apart, move against each other."""
+
+    def velocity(self, v: Tensor) -> Tensor:
+        return v - _of_other_side(v)
+
+    def all(self, flags: Tensor) -> Tensor:
+        return flags & _of_other_side(flags)
+
+
+class _MutualSimilarity(Similarity):
+    """(S(a, b) + S(b, a)) / 2 for images a and b of which both are warped.
+
+    ``evaluate`` takes first all a, then all b, ``(2B, C, *S)``, and their masks likewise. It returns S of its pair for
+    each of them ``(2B,)``, and the derivative of S(b, a) by a and of S(a, b) by b. Nothing changes when a and b change
+    places, except the places.
+    """
+
+    def __init__(self, settings: SimilaritySettings, grid: Grid) -> None:
+        self.settings, self.grid = settings, grid
+
+    def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        others = _of_other_side(warped)
+        similarity = make_similarity(self.settings.measure, others, self.settings.window, grid=self.grid)
+        value, slope = similarity.evaluate(warped, None if mask is None else mask * _of_other_side(mask))
+        return (value + _of_other_side(value)) / 2, slope
+
+
+def _of_other_side(both: Tensor) -> Tensor:
+    return both.roll(len(both) // 2, 0)
+
+
+def _start_in(space: MidSpace, u: Tensor, grid: Grid) -> Tensor:
+    """Return the displacement that does in the space between what u does in the fixed one."""
+    nodes = space.problem.grid.points(dtype=torch.float64, device=u.device)
+    points = space.to_fixed(nodes)
+    return (space.from_fixed(points + sample(u, points, grid)) - nodes).to(u)
 
 
 def _split(u: Tensor, grid: Grid) -> Tensor:
@@ -120,7 +186,7 @@ def common_axes(fixed: Image, moving: Image) -> Direction:
     return fixed.direction if torch.allclose(first, second, atol=1e-6) else tuple(map(tuple, world))
 
 
-def middle_frame(fixed: Image, moving: Image, axes: Direction) -> Image:
+def midspace_frame(fixed: Image, moving: Image, axes: Direction) -> Image:
     """Return an empty image between two in one world, the same whichever comes first.
 
     It lies along ``axes``, covers what the boxes around both have in common and some more, and its spacing is the
@@ -157,16 +223,16 @@ def _spacing_along(image: Image, place: Image) -> Tensor:
     return moved.squeeze(0).norm(dim=1)
 
 
-def between_tensors(scene: Scene) -> Middle:
+def midspace_of_tensors(problem: RegistrationProblem) -> MidSpace:
     """Return the space between two images on one grid: it is that of the grid."""
-    return Middle(scene, _same, _same)
+    return MidSpace(problem, _same, _same)
 
 
 def _same(points: Tensor) -> Tensor:
     return points
 
 
-def between_images(fixed: Subject, moving: Subject, affine: Affine | None, axes: Direction) -> Middle:
+def midspace_of_images(fixed: PlacedImage, moving: PlacedImage, affine: Affine | None, axes: Direction) -> MidSpace:
     """Return the space half-way between two images: from there the root of the affine map leads to either.
 
     Args:
@@ -176,12 +242,12 @@ def between_images(fixed: Subject, moving: Subject, affine: Affine | None, axes:
         axes: direction of the grid, from `common_axes`.
 
     Raises:
-        InputError: as `root`, `middle_frame`.
+        InputError: as `root`, `midspace_frame`.
     """
     half = root(affine or Affine.identity(fixed.image.grid.dim))
     back = half.inverse()
     both = fixed.moved(half), moving.moved(back)
-    frame = middle_frame(both[0].image, both[1].image, axes)
+    frame = midspace_frame(both[0].image, both[1].image, axes)
 
     def from_fixed(points: Tensor) -> Tensor:
         return frame.to_grid(half(fixed.image.to_world(points)))
@@ -189,4 +255,4 @@ def between_images(fixed: Subject, moving: Subject, affine: Affine | None, axes:
     def to_fixed(points: Tensor) -> Tensor:
         return fixed.image.to_grid(back(frame.to_world(points)))
 
-    return Middle(place(*both, frame), from_fixed, to_fixed)
+    return MidSpace(resample_pair(*both, frame), from_fixed, to_fixed)

@@ -14,11 +14,11 @@ from torchdeform.report.plots import (
     plot_overlay,
     plot_volume_histogram,
 )
-from torchdeform.report.report_data import Scene, make_scene
+from torchdeform.report.report_data import ReportData, make_report_data
 
 __all__ = [
-    "Scene",
-    "make_scene",
+    "ReportData",
+    "make_report_data",
     "plot_checkerboard",
     "plot_convergence",
     "plot_curl",

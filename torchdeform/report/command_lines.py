@@ -1,10 +1,11 @@
-"""The commands that repeat a registration and that apply it."""
+"""The commands that repeat a registration or apply it to other files."""
 
 import json
 import shlex
-from collections.abc import Mapping
-from dataclasses import fields
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import Any
 
 from torchdeform.core.interpolation import LABEL_MODE
 from torchdeform.registration.settings import RegistrationSettings
@@ -13,13 +14,13 @@ from torchdeform.registration.settings import RegistrationSettings
 def repeat_command(
     inputs: Mapping[str, str], settings: RegistrationSettings, device: str, memory: int | None = None
 ) -> str:
-    """Return the ``register`` line that gives the same result again.
+    """Return the ``register`` command that gives the same result again.
 
     Args:
         inputs: files and folder by the name of their option (``fixed``, ``moving``, ``out``, ``fixed_mask``, ...).
-        settings: all of them; those that differ from the preset ``default`` are named.
+        settings: all of them; those that differ from the preset ``default`` become options.
         device: ``cpu`` or ``cuda``.
-        memory: bytes to take at most, if there was a limit.
+        memory: limit in bytes, if there was one.
     """
     words = ["register", inputs["fixed"], inputs["moving"]]
     for name, path in inputs.items():
@@ -33,19 +34,27 @@ def repeat_command(
 
 
 def changed(settings: RegistrationSettings) -> dict[str, object]:
-    """Return the settings that differ from the defaults."""
-    names, usual = (field.name for field in fields(settings)), RegistrationSettings()
-    return {name: getattr(settings, name) for name in names if getattr(settings, name) != getattr(usual, name)}
+    """Return the settings that differ from the defaults, by their dotted names."""
+    return dict(_differences(settings, RegistrationSettings(), ""))
+
+
+def _differences(group: Any, defaults: Any, prefix: str) -> Iterator[tuple[str, object]]:
+    for name in (field.name for field in fields(group)):
+        value, default = getattr(group, name), getattr(defaults, name)
+        if is_dataclass(value):
+            yield from _differences(value, default, f"{prefix}{name}.")
+        elif value != default:
+            yield f"{prefix}{name}", value
 
 
 def apply_commands(inputs: Mapping[str, str], out: Path) -> dict[str, str]:
-    """Return lines that use the result on other files, by what they do."""
-    there, back = (str(out / name) for name in ("transform.h5", "inverse.h5"))
+    """Return commands that apply the result to other files, by a description."""
+    forward, back = (str(out / name) for name in ("transform.h5", "inverse.h5"))
     onto = ("--reference", inputs["fixed"])
     verbs = {
-        "another image of the moving space, onto the fixed grid": ("apply", there, "IMAGE", *onto),
-        "labels of the moving space": ("apply", there, "LABELS", *onto, "--interpolation", LABEL_MODE),
-        "points of the fixed space, to the moving space": ("points", there, "POINTS"),
+        "another image of the moving space, onto the fixed grid": ("apply", forward, "IMAGE", *onto),
+        "labels of the moving space": ("apply", forward, "LABELS", *onto, "--interpolation", LABEL_MODE),
+        "points of the fixed space, to the moving space": ("points", forward, "POINTS"),
         "points of the moving space, to the fixed space": ("points", back, "POINTS"),
     }
     return {what: shlex.join(("torchdeform", *words, "--out", "FILE")) for what, words in verbs.items()}

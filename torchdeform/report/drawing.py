@@ -1,8 +1,9 @@
-"""How slices are drawn on matplotlib axes: images, maps with their scales, moved grids, curves."""
+"""Drawing on matplotlib axes: slices of images, maps with their scales, deformed grids, curves."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,21 +16,36 @@ from torchdeform.report.planes import Plane
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
 INK, PAPER, LINES, FRAME = "#222222", "#ffffff", "#0b5fa5", "#bbbbbb"
-# Blue and orange, told apart by everybody; their sum is white.
+# Blue and orange, distinct with any colour blindness; their sum is white.
 BLUE, ORANGE = (0.0, 0.45, 1.0), (1.0, 0.55, 0.0)
-# Okabe and Ito's colours, which are told apart with any colour blindness; for lines on light and on dark paper.
+# The colours of Okabe and Ito, distinct with any colour blindness; for lines on a light or a dark page.
 CURVES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 _LARGEST = 1000  # pixels along a side that a panel can show
 
 Floats = NDArray[np.floating]
 
 
+def new_figure(width: float, height: float) -> "Figure":
+    """Return an empty figure of this size in inches."""
+    from matplotlib.figure import Figure
+
+    return Figure((width, height), dpi=110, layout="constrained", facecolor=PAPER)
+
+
+def save_png(figure: "Figure", path: Path) -> None:
+    """Write a figure as a PNG, without any window."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure).print_png(str(path))
+
+
 @dataclass(frozen=True)
 class Scale:
-    """How values become colours: a colour map of matplotlib, its ends, and what to write where."""
+    """How values become colours: a colour map of matplotlib, its ends, and the labels of its ticks."""
 
     colours: str
     low: float
@@ -48,26 +64,27 @@ def length_scale(limit: float, colours: str = "viridis") -> Scale:
 
 
 def difference_scale(limit: float) -> Scale:
-    """Return the scale of both differences."""
+    """Return the scale of the differences before and after."""
     return length_scale(limit, "inferno")
 
 
 def volume_scale(limit: float) -> Scale:
-    """Return the scale of log J, written as J at powers of 2."""
+    """Return the scale of log J, with ticks at powers of 2 of J."""
     top = int(limit / math.log(2) + 1e-6)
     ticks = tuple((k * math.log(2), f"{2.0**k:g}") for k in sorted({-top, 0, top}))
     return Scale("PuOr_r", -limit, limit, ticks)
 
 
 def rotation_scale(limit: float, dim: int) -> Scale:
-    """Return the scale of the curl, which has a sign in 2D, or of its length in 3D."""
+    """Return the scale of the curl: signed in 2D, its length in 3D."""
     return signed_scale(limit) if dim == 2 else length_scale(limit)
 
 
 def show(axes: "Axes", plane: Plane, pixels: Tensor, **how: Any) -> "AxesImage":
     """Show a slice ``(C, down, across)`` in node coordinates: pixel (i, j) spans i ± 1/2, j ± 1/2."""
     down, across = plane.shape
-    thin = _thin(pixels)
+    step = 1 + max(pixels.shape[1:]) // _LARGEST  # more pixels than can be seen would only cost time
+    thin = pixels[:, ::step, ::step].movedim(0, -1).float().numpy()
     shown = axes.imshow(
         thin if thin.shape[-1] == 3 else thin[..., 0],
         extent=(-0.5, across - 0.5, down - 0.5, -0.5),
@@ -78,25 +95,16 @@ def show(axes: "Axes", plane: Plane, pixels: Tensor, **how: Any) -> "AxesImage":
     return shown
 
 
-def _thin(pixels: Tensor) -> NDArray[np.float32]:
-    """Return a slice as ``(down, across, C)``, every so many pixels where there are more than can be seen."""
-    step = 1 + max(pixels.shape[1:]) // _LARGEST
-    return pixels[:, ::step, ::step].movedim(0, -1).float().numpy()
-
-
 def frame(axes: "Axes", plane: Plane) -> None:
-    """Frame a slice, turned for the eye."""
+    """Frame a slice and flip it to the usual view."""
     down, across = plane.shape
-    axes.set_xlim(*_turn((-0.5, across - 0.5), plane.turned[1]))
-    axes.set_ylim(*_turn((down - 0.5, -0.5), plane.turned[0]))
+    xlim, ylim = (-0.5, across - 0.5), (down - 0.5, -0.5)
+    axes.set_xlim(*(xlim[::-1] if plane.flipped[1] else xlim))
+    axes.set_ylim(*(ylim[::-1] if plane.flipped[0] else ylim))
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():
         spine.set_color(FRAME)
-
-
-def _turn(ends: tuple[float, float], turned: bool) -> tuple[float, float]:
-    return (ends[1], ends[0]) if turned else ends
 
 
 def draw_image(axes: "Axes", plane: Plane, pixels: Tensor) -> None:
@@ -105,7 +113,7 @@ def draw_image(axes: "Axes", plane: Plane, pixels: Tensor) -> None:
 
 
 def draw_map(axes: "Axes", plane: Plane, values: Tensor, scale: Scale, *, bar: bool = True) -> None:
-    """Show values in the colours of their scale, with a bar below that says what they mean."""
+    """Show values in the colours of their scale, with a colour bar below."""
     shown = show(axes, plane, values, cmap=scale.colours, vmin=scale.low, vmax=scale.high)
     if not bar:
         return
@@ -117,12 +125,12 @@ def draw_map(axes: "Axes", plane: Plane, values: Tensor, scale: Scale, *, bar: b
 
 
 def moved_lines(plane: Plane, u: Tensor, count: int) -> list[Floats]:
-    """Return where φ takes the lines of a regular grid in a slice, each ``(m, 2)`` as (across, down) in nodes.
+    """Return where φ moves the lines of a regular grid in a slice, each ``(m, 2)`` as (across, down) in nodes.
 
     Args:
         plane: the plane.
         u: displacement in the slice ``(D, down, across)``, units of spacing.
-        count: lines along the longer side, about.
+        count: about how many lines along the longer side.
     """
     at = np.stack(np.meshgrid(*map(np.arange, plane.shape), indexing="ij")).astype(np.float32)
     for position, axis in enumerate(plane.axes):
@@ -142,7 +150,7 @@ def _every(n: int, step: int) -> NDArray[np.int64]:
 
 
 def draw_lines(axes: "Axes", plane: Plane, u: Tensor, count: int) -> None:
-    """Draw where φ takes the lines of a regular grid."""
+    """Draw where φ moves the lines of a regular grid."""
     from matplotlib.collections import LineCollection
 
     axes.add_collection(LineCollection(moved_lines(plane, u, count), colors=LINES, linewidths=0.7))
@@ -150,18 +158,18 @@ def draw_lines(axes: "Axes", plane: Plane, u: Tensor, count: int) -> None:
 
 
 def draw_faint(axes: "Axes", plane: Plane, pixels: Tensor) -> None:
-    """Show an image as a pale ground for lines."""
+    """Show an image as a pale background for lines."""
     show(axes, plane, pixels.mean(0, keepdim=True), cmap="gray_r", vmin=0, vmax=3)
 
 
 def draw_convergence(axes: "Axes", result: RegistrationResult, *, item: int = 0) -> None:
     """Draw the similarity over the steps, one line per level."""
     start = 0
-    for level, colour in zip(result.levels, _cycle(CURVES, len(result.levels)), strict=True):
+    for level, colour in zip(result.levels, cycle(CURVES), strict=False):
         values = [value[item].item() for value in level.similarity]
         size = "×".join(map(str, level.shape[::-1]))
-        alone = "o" if len(values) == 1 else ""
-        axes.plot(range(start, start + len(values)), values, alone + "-", label=size, linewidth=1.6, color=colour)
+        marker = "o-" if len(values) == 1 else "-"  # a single point makes no line
+        axes.plot(range(start, start + len(values)), values, marker, label=size, linewidth=1.6, color=colour)
         start += max(len(values) - 1, 0)
     axes.set_xlabel("step", fontsize=9, color=INK)
     axes.set_ylabel(measure_name(result), fontsize=9, color=INK)
@@ -192,13 +200,9 @@ def _plain(axes: "Axes") -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _cycle(colours: Sequence[str], count: int) -> list[str]:
-    return [colours[k % len(colours)] for k in range(count)]
-
-
 def measure_name(result: RegistrationResult) -> str:
-    """Return the similarity that was used, or those that were."""
-    return " + ".join(similarity_weights(result.settings.similarity))
+    """Return the name of the similarity, or of several."""
+    return " + ".join(similarity_weights(result.settings.similarity.measure))
 
 
 def tinted(first: Floats, second: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Pictures of moved grids as the paper draws them: lines in a plane, in space a box with an octant cut out."""
+"""Pictures of deformed grids as in the paper: lines in 2D; in 3D the faces of a box with one octant cut out."""
 
 from collections.abc import Mapping
 from itertools import product
@@ -10,40 +10,37 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchdeform.errors import InputError
+from torchdeform.report import drawing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
-_INK, _PAPER = "#0b5fa5", "#ffffff"
-_LINES = {2: 64, 3: 40}  # most lines that are drawn along an axis
+_LINES = {2: 64, 3: 40}  # lines that are drawn along an axis at most
 _PANEL = {2: 4.0, 3: 4.6}  # inches
 
 Nodes = NDArray[np.floating]
 
 
 def write_grids(path: Path, grids: Mapping[str, Tensor], picture: Tensor | None = None) -> None:
-    """Draw moved grids side by side as a PNG, and in 2D the image they belong to before them.
+    """Draw deformed grids side by side as a PNG, in 2D with the image that they belong to on the left.
 
     Args:
         path: the file to write.
         grids: positions of the nodes by title, ``(1, D, *S)`` in units of spacing, array order.
-        picture: grey values ``(1, 1, *S)`` or colours ``(1, 3, *S)`` from 0 to 1, on the grid that was not moved; 2D.
+        picture: grey values ``(1, 1, *S)`` or colours ``(1, 3, *S)`` from 0 to 1, on the original grid; 2D.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     dim = next(iter(grids.values())).shape[1]
     panels = len(grids) + (picture is not None)
-    figure = Figure((panels * _PANEL[dim], _PANEL[dim]), dpi=110, layout="constrained", facecolor=_PAPER)
+    figure = drawing.new_figure(panels * _PANEL[dim], _PANEL[dim])
     if picture is not None:
         axes = figure.add_subplot(1, panels, 1)
         draw_picture(axes, picture, next(iter(grids.values())), "image")
     for place, (title, points) in enumerate(grids.items(), start=1 + panels - len(grids)):
         _PAINTERS[dim](figure, (1, panels, place), points, title)
     _share_limits(figure)
-    FigureCanvasAgg(figure).print_png(str(path))
+    drawing.save_png(figure, path)
 
 
 def draw_picture(axes: "Axes", picture: Tensor, points: Tensor, title: str) -> None:
@@ -66,7 +63,7 @@ def draw_plane(axes: "Axes", points: Tensor, title: str) -> None:
     nodes = _nodes(points, 2)[..., ::-1]  # (x, y) is (axis 1, axis 0)
     down, across = (_some(n, _LINES[2]) for n in nodes.shape[:2])
     lines = [*nodes[down], *nodes[:, across].swapaxes(0, 1)]
-    axes.add_collection(LineCollection(lines, colors=_INK, linewidths=0.5))
+    axes.add_collection(LineCollection(lines, colors=drawing.LINES, linewidths=0.5))
     axes.set_xlim(nodes[..., 0].min(), nodes[..., 0].max())
     axes.set_ylim(nodes[..., 1].max(), nodes[..., 1].min())
     axes.set_aspect("equal")
@@ -75,7 +72,7 @@ def draw_plane(axes: "Axes", points: Tensor, title: str) -> None:
 
 
 def draw_cutaway(axes: "Axes3D", points: Tensor, title: str) -> None:
-    """Draw the faces of a box of points ``(1, 3, n0, n1, n2)`` with the octant that faces the viewer cut out.
+    """Draw the faces of a box of points ``(1, 3, n0, n1, n2)`` without the octant in front of the viewer.
 
     Raises:
         InputError: points that are not ``(1, 3, n0, n1, n2)``.
@@ -85,7 +82,7 @@ def draw_cutaway(axes: "Axes3D", points: Tensor, title: str) -> None:
     nodes = _nodes(points, 3)[..., ::-1]  # x, y, z: array axis 0 upwards
     nodes = nodes[np.ix_(*(_some(n, _LINES[3]) for n in nodes.shape[:3]))]
     faces = np.concatenate([quads for axis in range(3) for quads in _visible(nodes, axis)])
-    axes.add_collection3d(Poly3DCollection(faces, facecolors=_PAPER, edgecolors=_INK, linewidths=0.25))
+    axes.add_collection3d(Poly3DCollection(faces, facecolors=drawing.PAPER, edgecolors=drawing.LINES, linewidths=0.25))
     low, high = nodes.reshape(-1, 3).min(0), nodes.reshape(-1, 3).max(0)
     for limit, a, b in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), low, high, strict=True):
         limit(a, b)
@@ -96,7 +93,7 @@ def draw_cutaway(axes: "Axes3D", points: Tensor, title: str) -> None:
 
 
 def _share_limits(figure: "Figure") -> None:
-    """Draw all plane panels to one scale, so that a stretched grid looks stretched."""
+    """Draw all 2D panels on one scale, so that a stretched grid looks stretched."""
     planes = [axes for axes in figure.axes if axes.name != "3d"]
     for name in ("xlim", "ylim") if planes else ():
         starts, stops = zip(*(getattr(axes, f"get_{name}")() for axes in planes), strict=True)
@@ -124,22 +121,22 @@ def _nodes(points: Tensor, dim: int) -> Nodes:
 
 
 def _some(n: int, most: int) -> NDArray[np.int64]:
-    """Return at most so many of 0 .. n − 1, the first and the last among them."""
+    """Return at most ``most`` of 0 .. n − 1, with the first and the last."""
     return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
 
 
 def _visible(nodes: Nodes, axis: int) -> list[Nodes]:
-    """Return the quadrangles seen along an axis: the last face without its quarter, and that quarter inside the box."""
-    turned = np.moveaxis(nodes, axis, 0)
-    middle = [n // 2 for n in turned.shape[:3]]
-    inside, outside = _quads(turned[middle[0]]), _quads(turned[-1])
+    """Return the cells seen along an axis: the last face without one quarter, and that quarter inside the box."""
+    layers = np.moveaxis(nodes, axis, 0)
+    middle = [n // 2 for n in layers.shape[:3]]
+    inside, outside = _quads(layers[middle[0]]), _quads(layers[-1])
     quarter = np.zeros(outside.shape[:2], dtype=bool)
     quarter[middle[1] :, middle[2] :] = True
     return [outside[~quarter], inside[quarter]]
 
 
 def _quads(face: Nodes) -> Nodes:
-    """Return the corners of the cells of a face ``(m, n, 3)`` in order around each, ``(m − 1, n − 1, 4, 3)``."""
+    """Return the corners of the cells of a face ``(m, n, 3)``, in order around each cell, ``(m − 1, n − 1, 4, 3)``."""
     ends = {0: slice(None, -1), 1: slice(1, None)}
     around = sorted(product((0, 1), repeat=2), key=lambda corner: (corner[0], corner[0] ^ corner[1]))
     return np.stack([face[ends[a], ends[b]] for a, b in around], axis=2)

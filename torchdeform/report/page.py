@@ -1,4 +1,4 @@
-"""``report.html``: one page, complete in itself, on which a person judges a registration."""
+"""``report.html``: one page without other files, on which a person judges a registration."""
 
 import base64
 import hashlib
@@ -8,7 +8,7 @@ from typing import Any
 
 from torchdeform.report.pictures import fitting_pictures
 from torchdeform.report.record import describe
-from torchdeform.report.report_data import Scene
+from torchdeform.report.report_data import ReportData
 from torchdeform.report.tables import command_lines, file_name, footer, tables, tiles
 from torchdeform.report.verdict import BAD, DOUBTFUL, GOOD, judge
 
@@ -17,15 +17,15 @@ _MARKS = {GOOD: "✓", DOUBTFUL: "!", BAD: "✗"}
 _MODES = {"swipe": "swipe", "flicker": "flicker", "checkerboard": "checkerboard", "overlay": "two colours"}
 
 
-def write_report(path: Path, scene: Scene, record: Mapping[str, Any] | None = None) -> None:
-    """Write a page with everything that tells whether a registration went well: no network, less than 5 MB.
+def write_report(path: Path, data: ReportData, record: Mapping[str, Any] | None = None) -> None:
+    """Write a page that shows whether a registration went well; it needs no network and has less than 5 MB.
 
     Args:
         path: the file to write, usually ``report.html``.
-        scene: what `make_scene` returns; its slices are those the page can show.
-        record: what ``result.json`` holds; `describe` of the scene's result when None, which knows no commands.
+        data: what `make_report_data` returns; the page can show its slices.
+        record: what ``result.json`` holds; when None that of `describe`, which has no commands.
     """
-    known = describe(scene.result, scene.fixed, scene.moving) if record is None else record
+    known = describe(data.result, data.fixed, data.moving) if record is None else record
     page = _render(
         verdict=judge(known),
         marks=_MARKS,
@@ -36,13 +36,13 @@ def write_report(path: Path, scene: Scene, record: Mapping[str, Any] | None = No
         tables=tables(known),
         commands=command_lines(known),
         footer=footer(known),
-        **fitting_pictures(scene),
+        **fitting_pictures(data),
     )
     path.write_text(page, encoding="utf-8")
 
 
 def _render(**context: object) -> str:
-    """Fill the template: everything but our own style and script is escaped, and no other script can run."""
+    """Fill the template. All text is escaped, and the page's own script is the only one that can run."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 

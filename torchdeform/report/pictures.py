@@ -1,4 +1,4 @@
-"""The pictures of the page, as large as it may be."""
+"""The pictures of the page, in the best quality that fits its size."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -15,28 +15,37 @@ from torchdeform.report.drawing import (
     signed_scale,
     volume_scale,
 )
-from torchdeform.report.report_data import Scene, Slices
-from torchdeform.report.web_images import UNITS, Frame, colours, curve, frame_of, grey_levels, grid_paths, sprite, stops
+from torchdeform.report.report_data import ReportData, Slices
+from torchdeform.report.web_images import (
+    UNITS,
+    Frame,
+    colours,
+    css_stops,
+    curve,
+    frame_of,
+    grey_levels,
+    grid_paths,
+    image_strip,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Largest side of a slice in pixels and quality of its JPEG, from the best to what surely fits.
+# Largest side of a slice in pixels and quality of its JPEG, from the best to one that always fits.
 _SIZES = {2: ((900, 88), (700, 80), (500, 70), (350, 50)), 3: ((256, 85), (224, 75), (192, 60), (144, 40))}
 _MOST = 4_200_000  # characters of all pictures together
 _GRID_LINES = {2: 40, 3: 28}
-_CURL = {2: "Curl", 3: "Length of the curl"}
 _CURVE_INCHES = (5.2, 2.5)
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One figure of the page, as sprites or as paths of lines by plane, and what it means."""
+    """One figure of the page with its caption: by plane, a strip of slices or the paths of a grid."""
 
     name: str
     title: str
     caption: str
-    sprites: Mapping[str, str] = field(default_factory=dict)
+    strips: Mapping[str, str] = field(default_factory=dict)
     paths: Mapping[str, list[str]] = field(default_factory=dict)
     bar: str = ""
     ticks: tuple[Mapping[str, object], ...] = ()
@@ -44,76 +53,73 @@ class Picture:
     @property
     def size(self) -> int:
         """Characters on the page."""
-        return sum(map(len, self.sprites.values())) + sum(len(p) for paths in self.paths.values() for p in paths)
+        return sum(map(len, self.strips.values())) + sum(len(p) for paths in self.paths.values() for p in paths)
 
 
-def fitting_pictures(scene: Scene) -> dict[str, object]:
-    """Return what the template needs to show a scene, in the best quality that fits the page."""
-    painters = (_Painter(scene, *size) for size in _SIZES[scene.result.grid.dim])
-    painter = next(painters)
-    while True:
-        pictures = painter.pictures()
-        worse = next(painters, None)
-        if worse is None or sum(picture.size for group in pictures.values() for picture in group) <= _MOST:
+def fitting_pictures(data: ReportData) -> dict[str, object]:
+    """Return the template's values for the pictures of a registration, in the best quality that fits the page."""
+    for size in _SIZES[data.result.grid.dim]:
+        renderer = _Renderer(data, *size)
+        pictures = renderer.pictures()
+        if sum(picture.size for group in pictures.values() for picture in group) <= _MOST:
             break
-        painter = worse
-    planes = painter.planes()
+    planes = renderer.planes()
     return {
         "planes": planes,
         "wide": round(sum(plane["shape"] for plane in planes), 3),
         "data": {plane["name"]: {key: plane[key] for key in ("positions", "labels")} for plane in planes},
-        "choices": [{"name": name, "title": title} for name, title in _others(scene).items()],
+        "choices": [{"name": name, "title": title} for name, title in _others(data).items()],
         "differences": pictures.pop("Differences"),
         "groups": pictures,
-        "curves": _curves(scene),
+        "curves": _curves(data),
         "dense": len(planes) > 1,
     }
 
 
-def _others(scene: Scene) -> dict[str, str]:
-    """Return what the fixed image can be compared with."""
-    aligned = scene.result.affine is not None
+def _others(data: ReportData) -> dict[str, str]:
+    """Return the images that can be compared with the fixed one, with their titles."""
+    aligned = data.result.affine is not None
     titles = {"warped": "warped", "moving": "moving, aligned" if aligned else "moving", "original": "moving, as it was"}
-    return {name: title for name, title in titles.items() if name in scene.slices[0].fields}
+    return {name: title for name, title in titles.items() if name in data.slices[0].fields}
 
 
-class _Painter:
-    """Paints a scene's slices in one size and quality."""
+class _Renderer:
+    """Makes the pictures in one size and quality."""
 
-    def __init__(self, scene: Scene, largest: int, quality: int) -> None:
-        self._scene, self._quality = scene, quality
-        self._parts = [(cuts, frame_of(cuts.plane, len(cuts.numbers), largest)) for cuts in scene.slices]
+    def __init__(self, data: ReportData, largest: int, quality: int) -> None:
+        self._data, self._quality = data, quality
+        self._parts = [(cuts, frame_of(cuts.plane, len(cuts.numbers), largest)) for cuts in data.slices]
 
     def planes(self) -> list[dict[str, Any]]:
-        """Return what the page knows of each plane."""
+        """Return the figures of each plane that the page needs."""
         return [_plane(cuts, frame) for cuts, frame in self._parts]
 
     def pictures(self) -> dict[str, list[Picture]]:
         """Return all pictures, in groups."""
-        scale = difference_scale(self._scene.limits["before"])
-        titles = {"fixed": "fixed", **_others(self._scene)}
+        scale = difference_scale(self._data.limits["before"])
+        titles = {"fixed": "fixed", **_others(self._data)}
         return {
             "Differences": [
                 self._map("before", "Difference before the deformation", scale),
                 self._map("after", "Difference after it", scale),
             ],
             "Images": [
-                Picture(name, title.capitalize(), _ABOUT[name], self._sprites(name, None))
+                Picture(name, title.capitalize(), _CAPTIONS[name], self._strips(name, None))
                 for name, title in titles.items()
             ],
             "The map": list(self._maps()),
         }
 
     def _maps(self) -> Iterator[Picture]:
-        limits, dim = self._scene.limits, self._scene.result.grid.dim
+        limits, dim = self._data.limits, self._data.result.grid.dim
         paths = {cuts.plane.name: grid_paths(cuts, frame, _GRID_LINES[dim]) for cuts, frame in self._parts}
-        yield Picture("grid", "Grid moved by the map", _ABOUT["grid"], paths=paths)
+        yield Picture("grid", "Deformed grid", _CAPTIONS["grid"], paths=paths)
         yield self._map("log_det", "Volume: moving / fixed", volume_scale(limits["log_det"]))
         yield self._map("divergence", "Divergence", signed_scale(limits["divergence"]))
         yield self._map(
             "rotation", "Curl" if dim == 2 else "Length of the curl", rotation_scale(limits["rotation"], dim)
         )
-        yield self._map("inverse_error", "Error of the inverse", length_scale(limits["inverse_error"]))
+        yield self._map("inverse_error", "Inverse consistency", length_scale(limits["inverse_error"]))
 
     def _map(self, name: str, title: str, scale: Scale) -> Picture:
         """Return a picture in the colours of a scale."""
@@ -121,30 +127,30 @@ class _Painter:
             {"place": round(100 * (value - scale.low) / (scale.high - scale.low), 2), "text": text}
             for value, text in scale.ticks
         )
-        return Picture(name, title, _ABOUT[name], self._sprites(name, scale), bar=stops(scale), ticks=ticks)
+        return Picture(name, title, _CAPTIONS[name], self._strips(name, scale), bar=css_stops(scale), ticks=ticks)
 
-    def _sprites(self, name: str, scale: Scale | None) -> dict[str, str]:
-        """Return a field's slices of every plane as data URIs."""
+    def _strips(self, name: str, scale: Scale | None) -> dict[str, str]:
+        """Return the slices of a field as data URIs, by plane."""
         found = {}
         for cuts, frame in self._parts:
             values = cuts.fields[name]
             pixels = grey_levels(values) if scale is None else colours(values, scale)
-            found[cuts.plane.name] = sprite(pixels, cuts.plane, frame, self._quality)
+            found[cuts.plane.name] = image_strip(pixels, cuts.plane, frame, self._quality)
         return found
 
 
-_ABOUT = {
+_CAPTIONS = {
     "fixed": "The image that stays.",
-    "warped": "The moving image seen through the map: this should look like the fixed one.",
+    "warped": "The moving image after the map: it should look like the fixed one.",
     "moving": "The moving image, on the grid of the fixed one.",
     "original": "The moving image before the alignment.",
     "before": "|fixed − moving|: dark where both agree.",
     "after": "|fixed − warped|, in the same scale.",
-    "grid": "Where points of the fixed image lie in the moving one. Lines never cross in a map without folds.",
-    "log_det": "How large a piece of tissue is in the moving image: 2 (orange) is twice the volume, 0.5 (purple) half.",
-    "divergence": "Of the displacement: above 0 where the moving image is larger, below where it is smaller.",
-    "rotation": "Of the displacement: how much the map turns.",
-    "inverse_error": "In voxels: how far going forth and back misses the start.",
+    "grid": "Where points of the fixed image are in the moving one. Without folds lines never cross.",
+    "log_det": "Size of a piece of tissue in the moving image: 2 (orange) is twice the volume, 0.5 (purple) half.",
+    "divergence": "Divergence of the displacement: positive where the moving image is larger, negative where smaller.",
+    "rotation": "Curl of the displacement: how much the map rotates.",
+    "inverse_error": "In voxels: how far a point is from itself after the map and its inverse.",
 }
 
 
@@ -161,21 +167,21 @@ def _plane(cuts: Slices, frame: Frame) -> dict[str, Any]:
     }
 
 
-def _curves(scene: Scene) -> list[dict[str, object]]:
-    """Return the histogram of volumes, and the similarity over the steps."""
+def _curves(data: ReportData) -> list[dict[str, object]]:
+    """Return the histogram of volumes and the curve of the similarity over the steps."""
     from markupsafe import Markup
 
     def volumes(axes: "Axes") -> None:
-        draw_volumes(axes, scene.volumes, scene.limits["log_det"])
+        draw_volumes(axes, data.volumes, data.limits["log_det"])
 
     def convergence(axes: "Axes") -> None:
-        draw_convergence(axes, scene.result)
+        draw_convergence(axes, data.result)
 
-    about = {
+    curves = {
         "Volumes": ("How often each change of volume occurs, over all voxels.", volumes),
-        "Convergence": (f"Similarity ({measure_name(scene.result)}) over the steps, by level.", convergence),
+        "Convergence": (f"Similarity ({measure_name(data.result)}) over the steps, by level.", convergence),
     }
     return [
         {"title": title, "caption": caption, "svg": Markup(curve(title, draw, *_CURVE_INCHES))}
-        for title, (caption, draw) in about.items()
+        for title, (caption, draw) in curves.items()
     ]

@@ -1,4 +1,4 @@
-"""Planes through images as they are looked at: the image itself in 2D; axial, coronal and sagittal slices in 3D."""
+"""Planes through images: the image itself in 2D; axial, coronal and sagittal slices in 3D."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ PLANES = ("axial", "coronal", "sagittal")
 
 @dataclass(frozen=True)
 class Plane:
-    """A way to cut a grid: the axes it shows (down, across), and which of them are turned for the eye."""
+    """A way to cut a grid: the axes it shows (down, across), and which of them are flipped to the usual view."""
 
     name: str
     grid: Grid
     axes: tuple[int, int]
-    turned: tuple[bool, bool]
+    flipped: tuple[bool, bool]
 
     @property
     def through(self) -> int | None:
-        """The array axis along which slices are counted; None in 2D, where there is one."""
+        """The array axis along which slices are counted; None in 2D, where there is one slice."""
         others = set(range(self.grid.dim)) - set(self.axes)
         return others.pop() if others else None
 
@@ -36,7 +36,7 @@ class Plane:
 
     @property
     def middle(self) -> int:
-        """The slice in the middle."""
+        """Number of the middle slice."""
         return self.depth // 2
 
     @property
@@ -72,7 +72,7 @@ class Plane:
         return self._upright(values[0])
 
     def chosen(self, field: Tensor, slices: Sequence[int]) -> Tensor:
-        """Return slices of a field ``(1, C, *S)`` as they lie in it, ``(1, C, *T)``."""
+        """Return slices of a field ``(1, C, *S)`` in the order of its axes, ``(1, C, *T)``."""
         if self.through is None:
             return field
         return field.index_select(self.through + 2, torch.tensor(list(slices), device=field.device))
@@ -86,22 +86,22 @@ class Plane:
 def planes_of(image: Image) -> list[Plane]:
     """Return the planes to show: the image itself in 2D; axial, coronal and sagittal ones in 3D.
 
-    Volumes are turned as radiologists look at them: superior up, anterior up or left, the patient's left on the right.
+    Volumes are shown as radiologists see them: superior up, anterior up or left, the patient's left on the right.
     """
     if image.grid.dim == 2:
         return [Plane("image", image.grid, (0, 1), (False, False))]
     z, y, x = _axes_along_world(image)
     against = [image.direction[world][2 - axis] < 0 for world, axis in ((2, z), (1, y), (0, x))]
-    turned = dict(zip((z, y, x), (not against[0], against[1], against[2]), strict=True))
+    flipped = dict(zip((z, y, x), (not against[0], against[1], against[2]), strict=True))
     pairs = zip(PLANES, ((y, x), (z, x), (z, y)), strict=True)
-    return [Plane(name, image.grid, axes, (turned[axes[0]], turned[axes[1]])) for name, axes in pairs]
+    return [Plane(name, image.grid, axes, (flipped[axes[0]], flipped[axes[1]])) for name, axes in pairs]
 
 
 def chosen_plane(image: Image, name: str | None, index: int | None) -> tuple[Plane, int]:
-    """Return the plane of a name and the slice of an index, the axial and the middle one where they are None.
+    """Return the plane of a name and the slice of an index; by default the axial plane and the middle slice.
 
     Raises:
-        InputError: an unknown name, any name in 2D, or a slice that is not there.
+        InputError: an unknown name, any name in 2D, or a slice that does not exist.
     """
     planes = {plane.name: plane for plane in planes_of(image)}
     if name is not None:
@@ -115,7 +115,7 @@ def chosen_plane(image: Image, name: str | None, index: int | None) -> tuple[Pla
 
 
 def _axes_along_world(image: Image) -> tuple[int, ...]:
-    """Return the array axes that lie most nearly along the world's z, y and x."""
+    """Return the array axes that are closest to the world axes z, y and x."""
     return max(
         permutations(range(3)),
         key=lambda axes: sum(abs(image.direction[2 - k][2 - axis]) for k, axis in enumerate(axes)),

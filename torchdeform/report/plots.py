@@ -1,7 +1,7 @@
 """Single pictures of a registration on matplotlib axes, for notebooks and papers."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict, Unpack
 
 import torch
 from torch import Tensor
@@ -14,78 +14,79 @@ from torchdeform.errors import InputError
 from torchdeform.registration.result import RegistrationResult
 from torchdeform.report import drawing
 from torchdeform.report.planes import Plane, chosen_plane
-from torchdeform.report.report_data import end_of_scale, grey, log_volume, seen, to_unit, volume_counts
+from torchdeform.report.report_data import (
+    end_of_scale,
+    grey,
+    log_volume,
+    sample_at_fixed,
+    signed_or_length,
+    to_unit,
+    volume_counts,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+class View(TypedDict, total=False):
+    """Where to draw, and which slice of a volume: the last three arguments of `plot_image`."""
+
+    axes: "Axes | None"
+    plane: str | None
+    index: int | None
+
+
 def plot_image(
     image: Image, *, axes: "Axes | None" = None, plane: str | None = None, index: int | None = None
 ) -> "Axes":
-    """Show an image, or a slice of one, from its 0.5th to its 99.5th percentile.
+    """Show an image, or one slice of a volume, from its 0.5th to its 99.5th percentile.
 
     Args:
         image: grey or in colours, 2D or 3D.
         axes: where to draw; matplotlib's current axes when None.
-        plane: ``axial``, ``coronal`` or ``sagittal`` in 3D; axial when None. Turned as radiologists look at it.
+        plane: ``axial``, ``coronal`` or ``sagittal`` in 3D; axial when None. Shown as radiologists see it.
         index: number of the slice, from 0; the middle one when None.
 
     Returns:
         The axes.
 
     Raises:
-        InputError: a plane or a slice that is not there.
+        InputError: a plane or a slice that does not exist.
     """
-    cut, number = chosen_plane(image, plane, index)
-    axes = _axes(axes)
-    drawing.draw_image(axes, cut, cut.cut(to_unit(_pixels(image), _pixels(image)), [number])[0])
+    axes, cut, number = _view(image, axes, plane, index)
+    pixels = image.data.detach().cpu()
+    drawing.draw_image(axes, cut, cut.cut(to_unit(pixels, pixels), [number])[0])
     return axes
 
 
-def plot_overlay(
-    fixed: Image, moving: Image, *, axes: "Axes | None" = None, plane: str | None = None, index: int | None = None
-) -> "Axes":
+def plot_overlay(fixed: Image, moving: Image, **view: Unpack[View]) -> "Axes":
     """Show two images over each other: fixed in blue, moving (or warped) in orange, white where both are bright.
 
     Args:
         fixed: image whose grid is shown.
-        moving: image of the same dimension; where it lies elsewhere it is sampled in its place in the world.
-        axes: as in `plot_image`.
-        plane: as in `plot_image`, of the fixed image.
-        index: as in `plot_image`, of the fixed image.
+        moving: image of the same dimension; it is sampled at its position in the world.
+        view: ``axes``, ``plane`` and ``index`` as in `plot_image`, of the fixed image.
 
     Returns:
         The axes.
 
     Raises:
-        InputError: a plane or a slice that is not there, or dimensions that differ.
+        InputError: a plane or a slice that does not exist, or dimensions that differ.
     """
-    cut, first, second = _both(fixed, moving, plane, index)
-    axes = _axes(axes)
+    axes, cut, first, second = _grey_slices(fixed, moving, **view)
     picture = drawing.tinted(first[0].numpy(), second[0].numpy())
     drawing.show(axes, cut, torch.as_tensor(picture).movedim(-1, 0))
     return axes
 
 
-def plot_checkerboard(
-    fixed: Image,
-    moving: Image,
-    *,
-    tiles: int = 8,
-    axes: "Axes | None" = None,
-    plane: str | None = None,
-    index: int | None = None,
-) -> "Axes":
-    """Show tiles of two images in turn: where they fit, edges run on from tile to tile.
+def plot_checkerboard(fixed: Image, moving: Image, *, tiles: int = 8, **view: Unpack[View]) -> "Axes":
+    """Show alternating tiles of two images: where they fit, edges continue from tile to tile.
 
     Args:
         fixed: image whose grid is shown; it has the first tile.
         moving: as in `plot_overlay`.
         tiles: along the longer side of the slice, at least 2.
-        axes: as in `plot_image`.
-        plane: as in `plot_image`, of the fixed image.
-        index: as in `plot_image`, of the fixed image.
+        view: ``axes``, ``plane`` and ``index`` as in `plot_image`, of the fixed image.
 
     Returns:
         The axes.
@@ -95,38 +96,24 @@ def plot_checkerboard(
     """
     if tiles < 2:
         raise InputError(f"tiles: a checkerboard has at least 2 tiles along a side, got {tiles}")
-    cut, first, second = _both(fixed, moving, plane, index)
-    axes = _axes(axes)
-    extent = [n * cut.grid.spacing[axis] for n, axis in zip(cut.shape, cut.axes, strict=True)]
-    side = max(extent) / tiles
-    down, across = (
-        (torch.arange(n) * cut.grid.spacing[axis] / side).floor().long()
-        for n, axis in zip(cut.shape, cut.axes, strict=True)
-    )
+    axes, cut, first, second = _grey_slices(fixed, moving, **view)
+    spacing = [cut.grid.spacing[axis] for axis in cut.axes]
+    side = max(n * h for n, h in zip(cut.shape, spacing, strict=True)) / tiles
+    down, across = ((torch.arange(n) * h / side).floor().long() for n, h in zip(cut.shape, spacing, strict=True))
     odd = (down[:, None] + across[None, :]) % 2 == 1
     drawing.draw_image(axes, cut, torch.where(odd, second, first))
     return axes
 
 
-def plot_difference(
-    fixed: Image,
-    moving: Image,
-    *,
-    limit: float | None = None,
-    axes: "Axes | None" = None,
-    plane: str | None = None,
-    index: int | None = None,
-) -> "Axes":
+def plot_difference(fixed: Image, moving: Image, *, limit: float | None = None, **view: Unpack[View]) -> "Axes":
     """Show |fixed − moving|, both scaled from 0 to 1 by their own percentiles: dark where they agree.
 
     Args:
         fixed: image whose grid is shown.
         moving: as in `plot_overlay`.
-        limit: what is drawn brightest; give both differences, before and after, the same one. When None, the 99.8th
-            percentile of the slice.
-        axes: as in `plot_image`.
-        plane: as in `plot_image`, of the fixed image.
-        index: as in `plot_image`, of the fixed image.
+        limit: value of the brightest colour; use one value to compare the differences before and after. When None,
+            the 99.8th percentile of the slice.
+        view: ``axes``, ``plane`` and ``index`` as in `plot_image`, of the fixed image.
 
     Returns:
         The axes.
@@ -134,181 +121,129 @@ def plot_difference(
     Raises:
         InputError: as `plot_overlay`.
     """
-    cut, first, second = _both(fixed, moving, plane, index)
+    axes, cut, first, second = _grey_slices(fixed, moving, **view)
     values = (first - second).abs()
-    axes = _axes(axes)
     drawing.draw_map(axes, cut, values, drawing.difference_scale(_limit(values, limit)))
     return axes
 
 
 def plot_grid(
-    u: Tensor,
-    space: Image | Grid,
-    *,
-    background: Image | None = None,
-    lines: int = 36,
-    axes: "Axes | None" = None,
-    plane: str | None = None,
-    index: int | None = None,
+    u: Tensor, space: Image | Grid, *, background: Image | None = None, lines: int = 36, **view: Unpack[View]
 ) -> "Axes":
-    """Draw where φ = id + u takes the lines of a regular grid in a slice: from the fixed to the moving space.
+    """Draw where φ = id + u moves the lines of a regular grid in a slice: from the fixed to the moving space.
 
     Args:
         u: displacement ``(1, D, *S)`` in units of spacing.
-        space: the image on whose grid it lives, or that grid.
+        space: the image on whose grid u is given, or that grid.
         background: image to show below, pale, such as the moving one.
-        lines: along the longer side, about.
-        axes: as in `plot_image`.
-        plane: as in `plot_image`, of ``space``.
-        index: as in `plot_image`, of ``space``.
+        lines: about how many lines along the longer side.
+        view: ``axes``, ``plane`` and ``index`` as in `plot_image`, of ``space``.
 
     Returns:
         The axes.
 
     Raises:
-        InputError: shape of u, a plane or a slice that is not there.
+        InputError: shape of u, a plane or a slice that does not exist.
 
     Notes:
         In 3D the lines are seen along the axis that the plane cuts.
     """
     place = _place(space)
     place.grid.check_vector(u, "plot_grid: u")
-    cut, number = chosen_plane(place, plane, index)
-    axes = _axes(axes)
+    axes, cut, number = _view(place, **view)
     if background is not None:
-        drawing.draw_faint(axes, cut, _seen(background, place, cut, number))
+        drawing.draw_faint(axes, cut, _grey_slice(background, place, cut, number))
     drawing.draw_lines(axes, cut, cut.cut(u.detach().cpu(), [number])[0], lines)
     axes.set_aspect(cut.aspect)
     return axes
 
 
-def plot_determinant(
-    u: Tensor,
-    space: Image | Grid,
-    *,
-    limit: float | None = None,
-    axes: "Axes | None" = None,
-    plane: str | None = None,
-    index: int | None = None,
-) -> "Axes":
+def plot_determinant(u: Tensor, space: Image | Grid, *, limit: float | None = None, **view: Unpack[View]) -> "Axes":
     """Show log J of φ = id + u, written as J: moving volume over fixed volume, orange where moving is larger.
 
     Args:
         u: displacement ``(1, D, *S)`` in units of spacing.
-        space: the image on whose grid it lives, or that grid.
-        limit: largest J that is told apart, above 1 (the smallest is 1 / limit); when None 2, or more where the map
-            wants it.
-        axes: as in `plot_image`.
-        plane: as in `plot_image`, of ``space``.
-        index: as in `plot_image`, of ``space``.
+        space: the image on whose grid u is given, or that grid.
+        limit: largest J of the scale, above 1 (the smallest is 1 / limit). When None 2, or more if the map needs it.
+        view: ``axes``, ``plane`` and ``index`` as in `plot_image`, of ``space``.
 
     Returns:
         The axes.
 
     Raises:
-        InputError: shape of u, a limit not above 1, a plane or a slice that is not there.
+        InputError: shape of u, a limit not above 1, a plane or a slice that does not exist.
     """
     if limit is not None and not limit > 1:
-        raise InputError(f"limit: the largest determinant to tell apart must be above 1, got {limit}")
+        raise InputError(f"limit: the largest determinant of the scale must be above 1, got {limit}")
     place = _place(space)
     values = _log_determinant(u, place.grid)
     scale = drawing.volume_scale(_volume_limit(values) if limit is None else math.log(limit))
-    return _plot_map(values, place, scale, axes, plane, index)
+    return _plot_map(values, place, scale, **view)
 
 
-def plot_divergence(
-    u: Tensor,
-    space: Image | Grid,
-    *,
-    limit: float | None = None,
-    axes: "Axes | None" = None,
-    plane: str | None = None,
-    index: int | None = None,
-) -> "Axes":
+def plot_divergence(u: Tensor, space: Image | Grid, *, limit: float | None = None, **view: Unpack[View]) -> "Axes":
     """Show div u = Σ_k ∂_k u_k.
 
     Args:
         u: displacement ``(1, D, *S)`` in units of spacing.
-        space: the image on whose grid it lives, or that grid.
+        space: the image on whose grid u is given, or that grid.
         limit: end of the scale; the 99.8th percentile when None.
-        axes: as in `plot_image`.
-        plane: as in `plot_image`, of ``space``.
-        index: as in `plot_image`, of ``space``.
+        view: ``axes``, ``plane`` and ``index`` as in `plot_image`, of ``space``.
 
     Returns:
         The axes.
 
     Raises:
-        InputError: shape of u, a plane or a slice that is not there.
+        InputError: shape of u, a plane or a slice that does not exist.
     """
     place = _place(space)
     values = divergence(u.detach().cpu(), place.grid)
-    return _plot_map(values, place, drawing.signed_scale(_limit(values, limit)), axes, plane, index)
+    return _plot_map(values, place, drawing.signed_scale(_limit(values, limit)), **view)
 
 
-def plot_curl(
-    u: Tensor,
-    space: Image | Grid,
-    *,
-    limit: float | None = None,
-    axes: "Axes | None" = None,
-    plane: str | None = None,
-    index: int | None = None,
-) -> "Axes":
+def plot_curl(u: Tensor, space: Image | Grid, *, limit: float | None = None, **view: Unpack[View]) -> "Axes":
     """Show curl u = ∂0 u1 − ∂1 u0 in 2D, its length |curl u| in 3D.
 
     Args:
         u: displacement ``(1, D, *S)`` in units of spacing.
-        space: the image on whose grid it lives, or that grid.
+        space: the image on whose grid u is given, or that grid.
         limit: end of the scale; the 99.8th percentile when None.
-        axes: as in `plot_image`.
-        plane: as in `plot_image`, of ``space``.
-        index: as in `plot_image`, of ``space``.
+        view: ``axes``, ``plane`` and ``index`` as in `plot_image`, of ``space``.
 
     Returns:
         The axes.
 
     Raises:
-        InputError: shape of u, a plane or a slice that is not there.
+        InputError: shape of u, a plane or a slice that does not exist.
     """
     place = _place(space)
-    turn = curl(u.detach().cpu(), place.grid)
-    values = turn if turn.shape[1] == 1 else turn.square().sum(1, keepdim=True).sqrt()
-    return _plot_map(values, place, drawing.rotation_scale(_limit(values, limit), place.grid.dim), axes, plane, index)
+    values = signed_or_length(curl(u.detach().cpu(), place.grid))
+    return _plot_map(values, place, drawing.rotation_scale(_limit(values, limit), place.grid.dim), **view)
 
 
 def plot_inverse_error(
-    u: Tensor,
-    inverse: Tensor,
-    space: Image | Grid,
-    *,
-    limit: float | None = None,
-    axes: "Axes | None" = None,
-    plane: str | None = None,
-    index: int | None = None,
+    u: Tensor, inverse: Tensor, space: Image | Grid, *, limit: float | None = None, **view: Unpack[View]
 ) -> "Axes":
-    """Show |φ(ψ(x)) − x| in voxels for φ = id + u and ψ = id + w: how far going back and forth misses the start.
+    """Show the inverse consistency |φ(ψ(x)) − x| in voxels for φ = id + u and its inverse ψ = id + w.
 
     Args:
         u: displacement ``(1, D, *S)`` in units of spacing.
         inverse: displacement w of the inverse, the same shape.
-        space: the image on whose grid they live, or that grid.
+        space: the image on whose grid u and w are given, or that grid.
         limit: end of the scale in voxels; the 99.8th percentile when None.
-        axes: as in `plot_image`.
-        plane: as in `plot_image`, of ``space``.
-        index: as in `plot_image`, of ``space``.
+        view: ``axes``, ``plane`` and ``index`` as in `plot_image`, of ``space``.
 
     Returns:
         The axes.
 
     Raises:
-        InputError: shapes, a plane or a slice that is not there.
+        InputError: shapes, a plane or a slice that does not exist.
     """
     place = _place(space)
     for name, field in (("u", u), ("inverse", inverse)):
         place.grid.check_vector(field, f"plot_inverse_error: {name}")
     values = voxels(compose(u.detach().cpu(), inverse.detach().cpu(), place.grid), place.grid)
-    return _plot_map(values, place, drawing.length_scale(_limit(values, limit)), axes, plane, index)
+    return _plot_map(values, place, drawing.length_scale(_limit(values, limit)), **view)
 
 
 def plot_volume_histogram(u: Tensor, space: Image | Grid, *, axes: "Axes | None" = None) -> "Axes":
@@ -316,7 +251,7 @@ def plot_volume_histogram(u: Tensor, space: Image | Grid, *, axes: "Axes | None"
 
     Args:
         u: displacement ``(1, D, *S)`` in units of spacing.
-        space: the image on whose grid it lives, or that grid.
+        space: the image on whose grid u is given, or that grid.
         axes: as in `plot_image`.
 
     Returns:
@@ -343,7 +278,7 @@ def plot_convergence(result: RegistrationResult, *, axes: "Axes | None" = None, 
         The axes.
 
     Raises:
-        InputError: an item that is not there.
+        InputError: an item that does not exist.
     """
     if not 0 <= item < len(result.similarity_after):
         raise InputError(f"item: the batch has {len(result.similarity_after)} items, from 0; there is no item {item}")
@@ -361,32 +296,36 @@ def _axes(axes: "Axes | None") -> "Axes":
 
 
 def _place(space: Image | Grid) -> Image:
-    """Return an image whose planes are those of ``space``; a bare grid lies along the axes of the world."""
+    """Return an image with the planes of ``space``; a bare grid gets the axes of the world."""
     if isinstance(space, Image):
         return space
     return Image(torch.zeros(()).expand(1, 1, *space.shape), space, name="the grid")
 
 
-def _pixels(image: Image) -> Tensor:
-    return image.data.detach().cpu()
+def _view(
+    image: Image, axes: "Axes | None" = None, plane: str | None = None, index: int | None = None
+) -> "tuple[Axes, Plane, int]":
+    """Return the axes to draw on, the plane and the number of its slice."""
+    cut, number = chosen_plane(image, plane, index)
+    return _axes(axes), cut, number
 
 
-def _both(fixed: Image, moving: Image, plane: str | None, index: int | None) -> tuple[Plane, Tensor, Tensor]:
-    """Return a plane, and both images in its slice in grey from 0 to 1, each ``(1, down, across)``."""
-    cut, number = chosen_plane(fixed, plane, index)
-    return cut, _seen(fixed, fixed, cut, number), _seen(moving, fixed, cut, number)
+def _grey_slices(fixed: Image, moving: Image, **view: Unpack[View]) -> "tuple[Axes, Plane, Tensor, Tensor]":
+    """Return the axes, a plane, and both images in its slice in grey from 0 to 1, each ``(1, down, across)``."""
+    axes, cut, number = _view(fixed, **view)
+    return axes, cut, _grey_slice(fixed, fixed, cut, number), _grey_slice(moving, fixed, cut, number)
 
 
-def _seen(image: Image, fixed: Image, cut: Plane, number: int) -> Tensor:
+def _grey_slice(image: Image, fixed: Image, cut: Plane, number: int) -> Tensor:
     """Return an image in a slice of the fixed one, in grey from 0 to 1, ``(1, down, across)``."""
     if image.grid.dim != fixed.grid.dim:
         raise InputError(f"{image.name} is {image.grid.dim}D and {fixed.name} {fixed.grid.dim}D; give two of a kind")
     values = grey(image.to("cpu")).detach()
-    return cut.arrange(to_unit(seen(values, image, fixed, cut.points([number])), values))[0]
+    return cut.arrange(to_unit(sample_at_fixed(values, image, fixed, cut.points([number])), values))[0]
 
 
 def _limit(values: Tensor, limit: float | None) -> float:
-    """Return the end of a scale: what was asked for, or what nearly all values keep."""
+    """Return the end of a scale: the given limit, or the value below which nearly all values are."""
     if limit is None:
         return end_of_scale(values, 1e-6)
     if not limit > 0:
@@ -402,11 +341,8 @@ def _volume_limit(values: Tensor) -> float:
     return end_of_scale(values, math.log(2))
 
 
-def _plot_map(
-    values: Tensor, place: Image, scale: drawing.Scale, axes: "Axes | None", plane: str | None, index: int | None
-) -> "Axes":
+def _plot_map(values: Tensor, place: Image, scale: drawing.Scale, **view: Unpack[View]) -> "Axes":
     """Draw a field ``(1, 1, *S)`` in a slice."""
-    cut, number = chosen_plane(place, plane, index)
-    axes = _axes(axes)
+    axes, cut, number = _view(place, **view)
     drawing.draw_map(axes, cut, cut.cut(values, [number])[0], scale)
     return axes

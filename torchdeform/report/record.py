@@ -25,13 +25,13 @@ def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[st
         moving: the moving image as read.
 
     Returns:
-        A mapping that `write_json` can write; sizes are in x, y, z order as in ITK, errors in voxels.
+        A mapping for `write_json`; sizes are in x, y, z order as in ITK, errors in voxels.
     """
     diagnosis = result.diagnosis
     return {
         "fixed": _place(fixed),
         "moving": _place(moving),
-        "similarity": result.settings.similarity,
+        "similarity": result.settings.similarity.measure,
         "similarity_before": result.similarity_before.item(),
         "similarity_after": result.similarity_after.item(),
         "folds": int(diagnosis.folds.item()),
@@ -68,7 +68,7 @@ def _alignment(result: RegistrationResult) -> dict[str, object]:
         return {"kind": "none"}
     found = result.alignment
     return {
-        "kind": result.settings.align if found else "given",
+        "kind": result.settings.align.kind if found else "given",
         "matrix": result.affine.matrix.tolist(),
         "offset": result.affine.offset.tolist(),
         "start": found and found.start,
@@ -78,7 +78,7 @@ def _alignment(result: RegistrationResult) -> dict[str, object]:
 
 
 def _evaluation(evaluation: Evaluation | None) -> dict[str, object]:
-    """Return overlap and distances before, after alignment and after all."""
+    """Return overlap and distances before, after the alignment and at the end."""
     if evaluation is None:
         return {}
     stages = {"before": evaluation.before, "aligned": evaluation.aligned, "after": evaluation.after}
@@ -86,7 +86,7 @@ def _evaluation(evaluation: Evaluation | None) -> dict[str, object]:
 
 
 def _measures(measures: Measures) -> dict[str, object]:
-    """Return the figures of one position; distances in mm."""
+    """Return the figures of one stage; distances in mm."""
     found: dict[str, object] = {}
     if measures.labels:
         names = [str(label) for label in measures.labels]
@@ -117,17 +117,17 @@ def device_name(device: torch.device) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that a result depends on."""
+    """Return the versions of the software that a result depends on."""
     return {"torchdeform": __version__, "torch": torch.__version__, "python": platform.python_version()}
 
 
 def write_json(record: Mapping[str, object], path: Path) -> None:
-    """Write a record as `as_json` makes it, a figure a line."""
+    """Write a record as JSON, one figure per line."""
     path.write_text(as_json(record, indent=2) + "\n", encoding="utf-8")
 
 
 def as_json(record: Mapping[str, object], indent: int | None = None) -> str:
-    """Return a record as JSON that every reader takes: numbers that are not finite become null."""
+    """Return a record as strict JSON: numbers that are not finite become null."""
     return json.dumps(_plain(record), indent=indent, allow_nan=False, default=str)
 
 

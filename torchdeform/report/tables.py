@@ -1,4 +1,4 @@
-"""What the page says in figures: tiles, tables, commands."""
+"""The figures of the page: tiles, tables, commands."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,15 +10,15 @@ from torchdeform.metrics.similarity import similarity_weights
 from torchdeform.report.command_lines import apply_commands
 from torchdeform.report.verdict import ends, number, value
 
-_LONG = 12  # rows that are shown without asking
-_STAGES = {"before": "before", "aligned": "aligned", "after": "after"}
+_LONG = 12  # a table with more rows is folded
+_STAGES = ("before", "aligned", "after")
 
 Record = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One figure in large type, with its name above and what it means below."""
+    """One figure in large type, with its name above and an explanation below."""
 
     name: str
     value: str
@@ -27,10 +27,10 @@ class Tile:
 
 @dataclass(frozen=True)
 class Part:
-    """Rows of a table below their heads.
+    """Rows of a table with their heads.
 
-    ``fold`` is what to click on to see them, empty where they are open; ``words`` says how many columns after the first
-    hold words, not figures.
+    ``fold`` is the text to click on to open them, empty if they are open; ``words`` is the number of columns after the
+    first that hold words, not figures.
     """
 
     head: Sequence[str]
@@ -41,7 +41,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Table:
-    """A section of figures."""
+    """A section of the page with figures."""
 
     title: str
     parts: Sequence[Part]
@@ -54,7 +54,7 @@ def file_name(place: Mapping[str, Any]) -> str:
 
 
 def tiles(record: Record) -> list[Tile]:
-    """Return the figures that matter most."""
+    """Return the most important figures."""
     measure = " + ".join(similarity_weights(record["similarity"]))
     frames = {2: 4, 3: 10}[len(record["fixed"]["size"])]
     low, high = number(record["determinant_min"]), number(record["determinant_max"])
@@ -67,12 +67,12 @@ def tiles(record: Record) -> list[Tile]:
         Tile(
             f"Similarity ({measure})",
             f"{number(record['similarity_before'])} → {number(record['similarity_after'])}",
-            "before → after deforming; higher is better",
+            "before → after the deformation; higher is better",
         ),
-        *_known(record),
+        *_accuracy(record),
         Tile("Volume, moving / fixed", f"{low} to {high}", "smallest and largest determinant of the map"),
         Tile(
-            "Error of the inverse",
+            "Inverse consistency",
             f"{_voxels(record['inverse_error_mean'])}",
             f"on average; {_voxels(record['inverse_error_max'])} at most",
         ),
@@ -80,12 +80,12 @@ def tiles(record: Record) -> list[Tile]:
     ]
 
 
-def _known(record: Record) -> list[Tile]:
-    """Return tiles for labels and landmarks, where they were given."""
+def _accuracy(record: Record) -> list[Tile]:
+    """Return tiles of labels and landmarks, if they were given."""
     found = []
     for key, name, unit, about in (
-        ("dice_mean", "Dice of the labels", "", "mean overlap before → after all; 1 is perfect"),
-        ("landmark_error_mean", "Distance of landmarks", " mm", "mean before → after all; 0 is perfect"),
+        ("dice_mean", "Dice of the labels", "", "mean overlap before → after; 1 is perfect"),
+        ("landmark_error_mean", "Distance of landmarks", " mm", "mean before → after; 0 is perfect"),
     ):
         before, after = ends(record, key)
         if math.isfinite(after):
@@ -102,19 +102,19 @@ def _seconds(time: float) -> str:
 
 
 def tables(record: Record) -> list[Table]:
-    """Return the tables of a record: labels, landmarks, what took how long, settings, versions."""
+    """Return the tables of a record: labels, landmarks, levels, time and memory, files, settings and versions."""
     found = [_labels(record), _landmarks(record), _levels(record), _costs(record), _images(record), _settings(record)]
     return [table for table in found if table is not None]
 
 
 def _measures(record: Record) -> dict[str, Mapping[str, Any]]:
-    """Return labels' and landmarks' measures by stage, as far as known."""
+    """Return the measures of labels and landmarks by stage, as far as known."""
     found = record.get("evaluation", {})
-    return {title: found[stage] for stage, title in _STAGES.items() if stage in found}
+    return {stage: found[stage] for stage in _STAGES if stage in found}
 
 
 def _labels(record: Record) -> Table | None:
-    stages = {title: m for title, m in _measures(record).items() if "dice" in m}
+    stages = {stage: m for stage, m in _measures(record).items() if "dice" in m}
     if not stages:
         return None
     after = stages["after"]["dice"]
@@ -122,8 +122,8 @@ def _labels(record: Record) -> Table | None:
         [label, *(number(m["dice"][label]) for m in stages.values()), *_far(stages, label)]
         for label in sorted(after, key=lambda label: value(after[label]) if math.isfinite(value(after[label])) else 2.0)
     ]
-    means = " → ".join(f"{number(m['dice_mean'])} {title}" for title, m in stages.items())
-    head = ["label", *(f"Dice {title}" for title in stages), *(f"distance {title}" for title in ("before", "after"))]
+    means = " → ".join(f"{number(m['dice_mean'])} {stage}" for stage, m in stages.items())
+    head = ["label", *(f"Dice {stage}" for stage in stages), "distance before", "distance after"]
     summary = (
         f"Mean Dice {means}, over {len(after)} labels; the worst come first. Distance: 95 % Hausdorff, in mm or the "
         "unit of the files."
@@ -132,11 +132,11 @@ def _labels(record: Record) -> Table | None:
 
 
 def _far(stages: Mapping[str, Mapping[str, Any]], label: str) -> list[str]:
-    return [number(stages[title]["hausdorff_95"][label]) for title in ("before", "after")]
+    return [number(stages[stage]["hausdorff_95"][label]) for stage in ("before", "after")]
 
 
 def _landmarks(record: Record) -> Table | None:
-    stages = {title: m for title, m in _measures(record).items() if "landmark_errors" in m}
+    stages = {stage: m for stage, m in _measures(record).items() if "landmark_errors" in m}
     if not stages:
         return None
     head = ["distance in mm", *stages]
@@ -163,18 +163,18 @@ def _levels(record: Record) -> Table | None:
         ]
         for level in record["levels"]
     ]
-    head = ["level", "steps", "similarity", "steps shortened, so as not to fold", "time"]
+    head = ["level", "steps", "similarity", "steps shortened to avoid folds", "time"]
     return Table("Levels, coarse to fine", [Part(head, rows)]) if rows else None
 
 
 def _costs(record: Record) -> Table:
-    """Return the time of each stage, and the most memory that was held until its end."""
-    held = record.get("memory") or {}
+    """Return the time of each stage, and the peak memory up to its end."""
+    peaks = record.get("memory") or {}
     rows = [
-        [stage, _seconds(seconds), f"{held[stage] / 1e9:.2f} GB" if held.get(stage) else "–"]
+        [stage, _seconds(seconds), f"{peaks[stage] / 1e9:.2f} GB" if peaks.get(stage) else "–"]
         for stage, seconds in record["seconds"].items()
     ]
-    return Table("Time and memory", [Part(["stage", "time", "memory, at most until then"], rows)])
+    return Table("Time and memory", [Part(["stage", "time", "peak memory so far"], rows)])
 
 
 def _images(record: Record) -> Table:
@@ -205,7 +205,7 @@ def _plain(setting: object) -> str:
 
 
 def command_lines(record: Record) -> dict[str, str]:
-    """Return the commands to repeat and to apply a registration by what they do, as far as its record knows them."""
+    """Return the commands that repeat and apply a registration, by a description; none if its record has none."""
     if "command" not in record:
         return {}
     again = {f"Repeat this registration, in {record['folder']}": str(record["command"])}
@@ -214,5 +214,5 @@ def command_lines(record: Record) -> dict[str, str]:
 
 
 def footer(record: Record) -> str:
-    """Return the last line."""
-    return f"torchdeform {record['versions']['torchdeform']}. The figures are in result.json, too."
+    """Return the last line of the page."""
+    return f"torchdeform {record['versions']['torchdeform']}. All figures are in result.json, too."

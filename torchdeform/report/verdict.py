@@ -1,4 +1,4 @@
-"""The headline of the page: whether a registration went well, in words."""
+"""The verdict on a registration: whether it went well, in words."""
 
 import math
 from collections.abc import Mapping
@@ -6,16 +6,16 @@ from dataclasses import dataclass
 from typing import Any
 
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
-_STEADY = 0.01  # a change by less than this share of the value is none
-_EXTREME = 10.0  # times that a volume may change before it is worth a look
-_FAR = 1.0  # voxels that going back and forth may miss
+_STEADY = 0.01  # share of a value below which a change does not count
+_EXTREME = 10.0  # factor of a change of volume from which on it is mentioned
+_FAR = 1.0  # largest inverse consistency in voxels that is not mentioned
 
 Record = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that speaks for or against a result: ``good``, ``doubtful`` or ``bad``, and a sentence."""
+    """One reason for or against a result: ``good``, ``doubtful`` or ``bad``, and a sentence."""
 
     kind: str
     text: str
@@ -23,7 +23,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What to think of a result: the worst of its findings, a headline, and the findings."""
+    """The verdict: the kind of the worst finding, a headline, and the findings, the worst first."""
 
     kind: str
     headline: str
@@ -38,25 +38,24 @@ _HEADLINES = {
 
 
 def judge(record: Record) -> Verdict:
-    """Return what the figures of a record say about a registration.
+    """Return the verdict from the figures of a record.
 
     Args:
-        record: what `describe` returns, with ``warnings`` where there are some.
+        record: what `describe` returns, with ``warnings`` if there are any.
 
     Notes:
-        No figure proves that the right tissue lies on the right tissue; only labels, landmarks and eyes can tell.
+        No figure proves that the right tissue is on the right tissue. Only labels, landmarks or a look can show it.
     """
     found = [_folds(record), _similarity(record), *_labels(record), *_landmarks(record), *_map(record)]
     found += [Finding(DOUBTFUL, f"Warning: {text}") for text in record.get("warnings", ())]
-    kind = next(kind for kind in (BAD, DOUBTFUL, GOOD) if kind == GOOD or any(f.kind == kind for f in found))
-    order = (BAD, DOUBTFUL, GOOD)
-    return Verdict(kind, _HEADLINES[kind], tuple(sorted(found, key=lambda finding: order.index(finding.kind))))
+    found.sort(key=lambda finding: (BAD, DOUBTFUL, GOOD).index(finding.kind))
+    return Verdict(found[0].kind, _HEADLINES[found[0].kind], tuple(found))
 
 
 def _folds(record: Record) -> Finding:
     folds = record["folds"]
     if folds == 0:
-        return Finding(GOOD, "The map folds nowhere: 0 voxels, by the full certificate of one-sided determinants.")
+        return Finding(GOOD, "The map does not fold anywhere (checked exactly, not only by central differences).")
     return Finding(BAD, f"The map folds at {folds:,} voxel{'s' if folds > 1 else ''}: it cannot be inverted there.")
 
 
@@ -91,39 +90,39 @@ def _landmarks(record: Record) -> list[Finding]:
         return []
     figures = f"mean distance {number(before)} → {number(after)} mm"
     if after > before * (1 + _STEADY):
-        return [Finding(BAD, f"The landmarks lie farther apart than before ({figures}).")]
+        return [Finding(BAD, f"The landmarks are farther apart than before ({figures}).")]
     if after > before * (1 - _STEADY):
-        return [Finding(DOUBTFUL, f"The landmarks lie no nearer than before ({figures}).")]
-    return [Finding(GOOD, f"The landmarks lie nearer than before ({figures}).")]
+        return [Finding(DOUBTFUL, f"The landmarks are no nearer than before ({figures}).")]
+    return [Finding(GOOD, f"The landmarks are nearer than before ({figures}).")]
 
 
 def _map(record: Record) -> list[Finding]:
-    """Return what the map itself gives to think about."""
+    """Return what is unusual about the map itself."""
     found = []
     low, high, error = (value(record[key]) for key in ("determinant_min", "determinant_max", "inverse_error_max"))
     if record["folds"] == 0 and (low < 1 / _EXTREME or high > _EXTREME):
         figures = f"volume × {number(low)} to × {number(high)}"
-        found.append(Finding(DOUBTFUL, f"Somewhere the map changes volumes more than tenfold ({figures})."))
+        found.append(Finding(DOUBTFUL, f"The map changes some volumes more than tenfold ({figures})."))
     if not error < _FAR:
-        figures = f"up to {number(error)} voxels"
-        found.append(Finding(DOUBTFUL, f"Going forth and back misses the start by more than a voxel ({figures})."))
+        text = f"Applying the map and then its inverse is off by more than one voxel (up to {number(error)} voxels)."
+        found.append(Finding(DOUBTFUL, text))
     return found
 
 
 def ends(record: Record, key: str) -> tuple[float, float]:
-    """Return a measure of labels or landmarks before and after all; NaN where it is not known."""
+    """Return a measure of labels or landmarks at the start and at the end; NaN if unknown."""
     measures = record.get("evaluation", {})
     before, after = (value(measures.get(stage, {}).get(key)) for stage in ("before", "after"))
     return before, after
 
 
 def value(figure: float | None) -> float:
-    """Return a figure of a record, NaN where there is none."""
+    """Return a figure of a record, NaN if it is missing."""
     return math.nan if figure is None else figure
 
 
 def number(figure: float | None) -> str:
-    """Return a figure with three digits, a dash where there is none."""
+    """Return a figure with three digits, a dash if it is missing."""
     if not math.isfinite(value(figure)):
         return "–"
     return f"{figure:.0f}" if abs(value(figure)) >= 1000 else f"{figure:.3g}"

@@ -1,4 +1,4 @@
-"""Pictures for the page: slices below each other in one JPEG, moved grids as SVG paths, curves as SVG."""
+"""Pictures for the page: slices below each other in one JPEG, deformed grids as SVG paths, curves as SVG."""
 
 import base64
 import io
@@ -18,17 +18,17 @@ from torchdeform.report.report_data import Slices
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MARGIN = 4  # rows repeated above and below a slice, so that a browser's smoothing does not mix neighbours
-_FEWEST = 160  # pixels that the longer side of a slice gets at least: JPEG's blocks of 16 would show in fewer
+_MARGIN = 4  # rows repeated above and below a slice, so that smoothing in a browser does not mix neighbours
+_FEWEST = 160  # pixels of the longer side of a slice at least: in fewer the blocks of a JPEG are visible
 _STOPS = 16  # colours of a bar
-UNITS = 4  # of the lines of a grid, in a pixel
+UNITS = 4  # SVG units per pixel
 
 Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Frame:
-    """How slices of a plane are drawn: pixels down and across, all of one size in the world."""
+    """Size of the slices of a plane in square pixels, and their number."""
 
     down: int
     across: int
@@ -41,13 +41,13 @@ class Frame:
 
     @property
     def positions(self) -> list[float]:
-        """CSS's vertical object-position of each slice in percent."""
+        """The vertical object-position of each slice for CSS, in percent."""
         room = self.slices * self.pitch - self.down
         return [round(100 * (k * self.pitch + _MARGIN) / room, 4) for k in range(self.slices)]
 
 
 def frame_of(plane: Plane, slices: int, largest: int) -> Frame:
-    """Return the frame of a plane whose longer side has at most so many pixels."""
+    """Return the frame of a plane whose longer side has at most ``largest`` pixels."""
     extent = [n * plane.grid.spacing[axis] for n, axis in zip(plane.shape, plane.axes, strict=True)]
     finest = min(plane.grid.spacing[axis] for axis in plane.axes)
     pixels = min(max(max(extent) / finest, _FEWEST), largest)
@@ -66,7 +66,7 @@ def colours(values: Tensor, scale: Scale) -> Bytes:
     return _table(scale)[place.round().byte().numpy()]
 
 
-def stops(scale: Scale) -> str:
+def css_stops(scale: Scale) -> str:
     """Return a scale's colours as the stops of a CSS gradient."""
     chosen = _table(scale)[np.linspace(0, 255, _STOPS).round().astype(int)]
     return ", ".join(f"#{r:02x}{g:02x}{b:02x}" for r, g, b in chosen)
@@ -78,12 +78,12 @@ def _table(scale: Scale) -> Bytes:
     return (colormaps[scale.colours](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
 
 
-def sprite(pixels: Bytes, plane: Plane, frame: Frame, quality: int) -> str:
-    """Return slices ``(n, h, w, 1 or 3)`` below each other, turned for the eye, as a JPEG in a data URI."""
+def image_strip(pixels: Bytes, plane: Plane, frame: Frame, quality: int) -> str:
+    """Return slices ``(n, h, w, 1 or 3)`` below each other, in the usual view, as a JPEG in a data URI."""
     from PIL import Image as Picture
 
-    turned = pixels[:, :: -1 if plane.turned[0] else 1, :: -1 if plane.turned[1] else 1]
-    rows = [np.asarray(_resized(flat.squeeze(-1) if flat.shape[-1] == 1 else flat, frame)) for flat in turned]
+    shown = pixels[:, :: -1 if plane.flipped[0] else 1, :: -1 if plane.flipped[1] else 1]
+    rows = [np.asarray(_resized(flat.squeeze(-1) if flat.shape[-1] == 1 else flat, frame)) for flat in shown]
     padding = ((_MARGIN, _MARGIN), (0, 0), (0, 0))
     sheet = np.concatenate([np.pad(row, padding[: row.ndim], mode="edge") for row in rows])
     file = io.BytesIO()
@@ -100,7 +100,7 @@ def _resized(flat: Bytes, frame: Frame) -> Bytes:
 
 
 def grid_paths(cuts: Slices, frame: Frame, count: int) -> list[str]:
-    """Return the moved grid in every slice as the d of an SVG path, with UNITS units to a pixel of the frame."""
+    """Return the deformed grid of every slice as the d of an SVG path, with `UNITS` units per pixel of the frame."""
     return [_path(moved_lines(cuts.plane, u, count), cuts.plane, frame) for u in cuts.fields["u"]]
 
 
@@ -109,14 +109,14 @@ def _path(lines: Sequence[NDArray[np.floating]], plane: Plane, frame: Frame) -> 
     size = np.array((UNITS * frame.across / across, UNITS * frame.down / down))
     parts = []
     for line in lines:
-        turned = np.where(plane.turned[::-1], np.array((across, down)) - 1 - line, line)
-        steps = _thinned(((turned + 0.5) * size).round().astype(int))
+        shown = np.where(plane.flipped[::-1], np.array((across, down)) - 1 - line, line)
+        steps = _thinned(((shown + 0.5) * size).round().astype(int))
         parts.append("M" + "l".join(f"{x} {y}" for x, y in steps.tolist()))
     return "".join(parts).replace(" -", "-")
 
 
 def _thinned(points: NDArray[np.int_]) -> NDArray[np.int_]:
-    """Return the first point and the steps between points, about every second pixel."""
+    """Return the first point and the steps between points, about one per two pixels."""
     length = np.abs(np.diff(points, axis=0)).max(1).sum() if len(points) > 1 else 0
     every = max(1, round(2 * UNITS * len(points) / max(length, 1)))
     kept = points[np.unique(np.append(np.arange(0, len(points), every), len(points) - 1))]
@@ -124,11 +124,11 @@ def _thinned(points: NDArray[np.int_]) -> NDArray[np.int_]:
 
 
 def curve(name: str, draw: Callable[["Axes"], None], width: float, height: float) -> str:
-    """Return what a function draws on axes as an SVG element that takes the colour of the text around it.
+    """Return what a function draws on axes as an SVG element in the colour of the surrounding text.
 
     Args:
-        name: of the picture, from which the names inside it are made.
-        draw: draws.
+        name: of the picture; the names inside the SVG are derived from it.
+        draw: draws on the axes.
         width: in inches, for the size of the text.
         height: in inches.
     """
@@ -148,7 +148,7 @@ def curve(name: str, draw: Callable[["Axes"], None], width: float, height: float
 
 
 def _for_page(svg: str) -> str:
-    """Leave out what a page does not want: the prologue, metadata, a style for everything, fixed sizes and ink."""
+    """Return an SVG without what a page cannot use: the prologue, metadata, global styles, fixed sizes and colours."""
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>", "", svg, flags=re.DOTALL)
     svg = re.sub(r'<svg [^>]*?viewBox="([^"]*)"[^>]*>', r'<svg viewBox="\1" aria-hidden="true">', svg, count=1)

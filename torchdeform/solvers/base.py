@@ -1,7 +1,9 @@
-"""What a solver returns: the value, and how it went, per batch item. Failure is a value."""
+"""What a linear solver is: it is made ready for a system once, then answers loads; failure is a value."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any, Protocol
 
 from torch import Tensor
 
@@ -42,3 +44,61 @@ class Solution:
     def ok(self) -> bool:
         """True when every item converged."""
         return all(s.ok for s in self.status)
+
+
+class System(Protocol):
+    """A self-adjoint, positive definite K(θ) on fields ``(B, C, *S)`` whose given unknowns are zero."""
+
+    @property
+    def parameters(self) -> tuple[Tensor, ...]:
+        """The tensors θ that K is made of."""
+        ...
+
+    def apply(self, v: Tensor, *parameters: Tensor) -> Tensor:
+        """Return K(θ) v, without a matrix; with its own θ where none are given."""
+        ...
+
+    def free(self, load: Tensor) -> Tensor:
+        """Return the load with zeros at given unknowns."""
+        ...
+
+    def mass(self, v: Tensor) -> Tensor:
+        """Return M v, M being the mass matrix on the free unknowns."""
+        ...
+
+    def diagonal(self, like: Tensor) -> Tensor:
+        """Return the diagonal of K, anything positive at given unknowns, with the type and device of ``like``."""
+        ...
+
+    def matrix(self, device: object = "cpu") -> Tensor:
+        """Return K as a coalesced ``torch.sparse_coo_tensor`` of float64, the identity at given unknowns."""
+        ...
+
+
+class Factor(ABC):
+    """A solver made ready for one system."""
+
+    @abstractmethod
+    def solution(self, load: Tensor) -> Solution:
+        """Return v with K v = load, and how the solve went.
+
+        Args:
+            load: right-hand side ``(B, C, *S)``; what it says about given unknowns is left out.
+        """
+
+    @abstractmethod
+    def __call__(self, load: Tensor, *, power: int = 1) -> Tensor:
+        """Return v = (K⁻¹ M)^(power − 1) K⁻¹ load: each further power smooths v once more.
+
+        Args:
+            load: as for `solution`.
+            power: 1 solves K v = load.
+        """
+
+
+class LinearSolver(Protocol):
+    """A way to solve K v = load. One that knows more of its systems than `System` says names their type."""
+
+    def init(self, system: Any, like: Tensor) -> Factor:
+        """Return the solver made ready for a system, for loads with the type and device of ``like``."""
+        ...

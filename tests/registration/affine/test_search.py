@@ -6,8 +6,8 @@ from affine_pairs import make_pair, make_true, turn
 
 from torchdeform.registration.affine.align import align
 from torchdeform.registration.affine.lie import angle
-from torchdeform.registration.affine.objective import Frame, Masked
-from torchdeform.registration.affine.search import body, make_starts
+from torchdeform.registration.affine.objective import MaskedImage, NormalisedFrame
+from torchdeform.registration.affine.search import image_moments, make_starts
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -26,9 +26,9 @@ def test_principal_axes_give_the_rotation_of_an_elongated_body(dim):
     for place, back in zip(make_pair(make_true(turn(dim, 50))), (turn(dim, 0), turn(dim, -50)), strict=True):
         own = make_true(back, 0.0, 0.0, 0.0)(place.to_world(place.grid.points(dtype=torch.float64)))
         lengths = place.grid.along((10.0, 6.0, 3.0)[:dim], own)
-        parts.append(Masked(place, torch.exp(-(own / lengths).square().sum(1, keepdim=True))))
-    frame = Frame.of(parts[0].image)
-    starts = make_starts(body(parts[0], frame), body(parts[1], frame), turn=True, scale=False)
+        parts.append(MaskedImage(place, torch.exp(-(own / lengths).square().sum(1, keepdim=True))))
+    frame = NormalisedFrame.of(parts[0].image)
+    starts = make_starts(image_moments(parts[0], frame), image_moments(parts[1], frame), turn=True, scale=False)
     axes = [s.map[:dim, :dim] for s in starts if s.name.startswith("moments")]
     assert len(axes) == 2 ** (dim - 1)
     assert min(float(angle(a @ turn(dim, -50))) for a in axes) < 5

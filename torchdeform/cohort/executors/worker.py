@@ -17,7 +17,7 @@ from torchdeform.errors import ComputationError
 T = TypeVar("T")
 
 _STARTS = 3  # times that a process is started before it is said that none can be
-_VICTIM = 500  # of 1000: how readily Linux kills a worker, rather than anything else, when memory runs out
+_OOM_SCORE = 500  # of 1000: how readily Linux kills a worker, rather than anything else, when memory runs out
 _READY = "ready"
 
 
@@ -125,7 +125,7 @@ class Worker:
         self._process = None
         if timeout is not None:
             return TimeLimit(f"it was given up after {timeout:g} seconds; raise engine.timeout if it needs more")
-        return WorkerLost(_obituary(process.returncode))
+        return WorkerLost(_exit_reason(process.returncode))
 
     @staticmethod
     def _reap(process: subprocess.Popen[bytes]) -> None:
@@ -136,7 +136,7 @@ class Worker:
                     pipe.close()
 
 
-def _obituary(code: int) -> str:
+def _exit_reason(code: int) -> str:
     """Return why a process ended, as far as its exit code tells."""
     if code == -9:
         return (
@@ -180,7 +180,7 @@ def serve() -> None:
     with os.fdopen(os.dup(0), "rb") as source, os.fdopen(os.dup(1), "wb") as sink:
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         os.dup2(2, 1)
-        _offer_as_victim()
+        _raise_oom_score()
         threading.Thread(target=_listen, args=(source, calls), daemon=True).start()
         _answer(sink, _READY)
         while True:
@@ -216,7 +216,7 @@ def _answer(sink: IO[bytes], answer: object) -> None:
     sink.flush()
 
 
-def _offer_as_victim() -> None:
+def _raise_oom_score() -> None:
     """Ask Linux to kill this process first, rather than the one that keeps the books."""
     with suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text(str(_VICTIM), encoding="ascii")
+        Path("/proc/self/oom_score_adj").write_text(str(_OOM_SCORE), encoding="ascii")

@@ -1,7 +1,6 @@
 """Alignment: the rigid, similarity or affine map of the world that brings two images together, from any start."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -10,88 +9,35 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, luminance, require_registrable, resample
+from torchdeform.core.intensities import fill, to_common_scale
 from torchdeform.core.resampling import with_voxels
 from torchdeform.core.transform import Affine
-from torchdeform.core.warp import sample
 from torchdeform.errors import ComputationError, InputError, require_choice
-from torchdeform.metrics.correlation import DetailCorrelation
-from torchdeform.metrics.similarity import Similarity, features, make_similarity, on_one_scale, similarity_weights
+from torchdeform.metrics.correlation import ForegroundLNCC
+from torchdeform.metrics.similarity import Similarity, features, make_similarity, needs_common_scale, similarity_weights
 from torchdeform.registration.affine.lie import generators
-from torchdeform.registration.affine.objective import Frame, Level, Masked
-from torchdeform.registration.affine.search import Candidate, Found, climbed, search
-from torchdeform.registration.settings import ALIGNMENTS
+from torchdeform.registration.affine.objective import AffineObjective, MaskedImage, NormalisedFrame
+from torchdeform.registration.affine.search import Candidate, SearchResult, optimised, search
+from torchdeform.registration.affine.settings import ALIGNMENTS, COARSEST_NODES, AlignmentSettings
 
-# Nodes of the coarsest level at most, where all starts are tried, and how much finer a level is tried for the finest.
-_COARSEST = 4096
-_FINER = 1.02
+# Factor by which voxels grow until the finest level has few enough nodes.
+_COARSER = 1.02
 
-# Nodes of the finest level and width of the LNCC window where nothing else is asked for. In 2D finer levels made the
-# map worse (brain slices, tissue sections): one part fits in every detail, and the rest, which bends, goes with it.
-_NODES = {2: 20_000, 3: 150_000}
-_WINDOW = {2: 7, 3: 5}
-
-# Voxels around a mask that belong to the picture.
+# Voxels around a mask that are kept.
 _MARGIN = 4
 
-# Voxels within which the summit of a level is found, and that of the finest.
-_NEAR, _NEAREST = 0.02, 0.01
+# Shortest step in voxels, on all levels and on the finest.
+_SHORTEST, _SHORTEST_AT_LAST = 0.02, 0.01
 
-# Levels on which several candidates are climbed.
-_CONTEST = 2
+# Levels on which several candidates are optimised.
+_LEVELS_OF_SEVERAL = 2
 
 # A ratio of sizes nearer to 1 than this needs no other voxels.
 _SAME_SIZE = 1.05
 
-# An overlap, and changes of length, that are worth a warning.
+# There is a warning about a smaller overlap, and about factors of length beyond these.
 _LITTLE_OVERLAP = 0.5
-_LENGTHS = (0.5, 2.0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class AlignmentSettings:
-    """How images are aligned.
-
-    Args:
-        similarity: name, or names with weights, as in `RegistrationSettings`. ``lncc`` alone is `DetailCorrelation`,
-            which also finds maps between many different contrasts; ``nmi`` is for those it does not. ``mind`` suits
-            tissue sections that turn little.
-        window: width of the LNCC window in voxels of each level, odd; 7 in 2D and 5 in 3D when None.
-        rotations: try rotations all around, and mirror images, at the coarsest level; otherwise only the files'
-            geometry and the centres are starts, which finds rotations up to some 30°.
-        nodes: nodes of the finest level at most, 20 000 in 2D and 150 000 in 3D when None. More take longer, and are
-            better only where one affine map fits everything.
-        min_overlap: share of the smaller image (or mask) that must lie in the other one.
-        steps: evaluations of the similarity at most on each level.
-
-    Raises:
-        InputError: a value out of range, named.
-    """
-
-    similarity: str | Mapping[str, float] = "lncc"
-    window: int | None = None
-    rotations: bool = True
-    nodes: int | None = None
-    min_overlap: float = 0.3
-    steps: int = 40
-
-    def __post_init__(self) -> None:
-        similarity_weights(self.similarity)
-        if self.window is not None and (self.window < 3 or self.window % 2 == 0):
-            raise InputError(f"window must be an odd number of voxels, at least 3, got {self.window}")
-        if not 0 < self.min_overlap <= 1:
-            raise InputError(f"min_overlap must lie between 0 and 1, got {self.min_overlap}")
-        if self.nodes is not None and self.nodes < _COARSEST:
-            raise InputError(f"nodes must be at least {_COARSEST}, got {self.nodes}")
-        if self.steps < 1:
-            raise InputError(f"steps must be at least 1, got {self.steps}")
-
-    def window_in(self, dim: int) -> int:
-        """Return the width of the window for images of ``dim`` axes."""
-        return self.window or _WINDOW[dim]
-
-    def nodes_in(self, dim: int) -> int:
-        """Return the nodes of the finest level at most for images of ``dim`` axes."""
-        return self.nodes or _NODES[dim]
+_LENGTH_FACTORS = (0.5, 2.0)
 
 
 @dataclass(frozen=True)
@@ -104,7 +50,7 @@ class Alignment:
         similarity_before: similarity in the files' own geometry, on the finest level; None without overlap.
         similarity_after: similarity through the map, higher is better; None without overlap, which only kind ``none``
             leaves.
-        start: where the climb began.
+        start: name of the start from which it was found.
         seconds: wall time.
         warnings: sentences about what looks wrong.
     """
@@ -121,19 +67,19 @@ class Alignment:
 def align(
     fixed: Image,
     moving: Image,
-    kind: str = "affine",
+    kind: str | None = None,
     *,
     fixed_mask: Image | None = None,
     moving_mask: Image | None = None,
     settings: AlignmentSettings | None = None,
 ) -> Alignment:
-    """Return the map φ(x) = M x + t of the world that maximises S(fixed, moving ∘ φ), from wherever the images lie.
+    """Return the map φ(x) = M x + t of the world that maximises S(fixed, moving ∘ φ), wherever the images are.
 
     Args:
         fixed: image that stays, grey or colour.
         moving: image to be aligned with it; another grid, direction or spacing does not matter.
-        kind: ``none``, ``translation``, ``rigid`` (rotation and shift), ``similarity`` (and one scale) or ``affine``.
-        fixed_mask: where the fixed image counts, not 0; anywhere in the world.
+        kind: as in `AlignmentSettings`; that of the settings when None.
+        fixed_mask: where the fixed image counts, not 0; on any grid.
         moving_mask: the same for the moving image.
         settings: defaults when None.
 
@@ -147,72 +93,52 @@ def align(
     Notes:
         Starts are the files' geometry, the centres of the boxes, the centres of mass and the principal axes, each with
         rotations all around (36 in 2D, the 60 of the icosahedron in 3D), on a grid of some 4000 nodes. The best are
-        climbed by BFGS on the group of maps, coarse to fine; the files' geometry competes again on the second level,
-        and is kept at the end if nothing is more similar. The map depends on the world positions of the voxels, not
-        on the order of the axes in the file. Determinants are positive: maps grow from rotations by exponentials.
-        Runs on the images' device, in float32; not differentiable, see `affine_warp`.
+        optimised by BFGS on the group of maps, coarse to fine. The files' geometry is tried again on the second level,
+        and is the result if nothing is more similar. The map depends on the world positions of the voxels, not on the
+        order of the axes in the file. Determinants are positive: maps are rotations times exponentials.
+        Runs on the images' device, in float32; not differentiable.
     """
     settings, began = settings or AlignmentSettings(), perf_counter()
+    kind = settings.kind if kind is None else kind
     require_choice(kind, ALIGNMENTS, "align: kind")
     pair = _prepared((fixed, fixed_mask), (moving, moving_mask), settings)
-    frame = Frame.of(pair[0].image)
-    levels, found = _levels(*pair, frame, settings), Found([])
-    still = Candidate("geometry", torch.eye(fixed.grid.dim + 1, dtype=torch.float64), 0.0)
-    best = still
+    frame = NormalisedFrame.of(pair[0].image)
+    objectives, found = _make_objectives(*pair, frame, settings), SearchResult([])
     if kind != "none":
         turn = settings.rotations and kind != "translation"
-        found = search(levels[0], kind, turn=turn, steps=settings.steps)
+        found = search(objectives[0], kind, turn=turn, steps=settings.steps)
         if abs(math.log(found.size)) > math.log(_SAME_SIZE):
-            levels = _levels(*pair, frame, settings, found.size)
-        best = _descend(levels, [*found.candidates, still], kind, settings)
-    before = _valued(levels[-1], still)
-    best = before if kind == "none" else best
-    if best.value <= before.value:
-        best = before
+            objectives = _make_objectives(*pair, frame, settings, found.size)
+    identity = torch.eye(fixed.grid.dim + 1, dtype=torch.float64)
+    before = Candidate("geometry", identity, float(objectives[-1].values(identity.unsqueeze(0))[0]))
+    best = before
+    if kind != "none":
+        after = _optimise_levels(objectives, [*found.candidates, before], kind, settings)
+        best = after if after.value > before.value else before
     return Alignment(
         Affine(*frame.to_affine(best.map)),
         _finite(before.value),
         _finite(best.value),
         best.name,
         perf_counter() - began,
-        _warnings(levels[-1], best, found, (fixed.name, moving.name)),
+        _warnings(objectives[-1], best, found, (fixed.name, moving.name)),
     )
 
 
-def affine_warp(
-    moving: Image, fixed: Image, affine: Affine, *, mode: str = "linear", outside: float | None = 0.0
-) -> Tensor:
-    """Return moving(M x + t) at the nodes x of ``fixed``.
-
-    Args:
-        moving: the image to sample.
-        fixed: the image whose grid is wanted.
-        affine: fixed world -> moving world.
-        mode: ``linear`` or ``nearest``.
-        outside: value outside the moving image; None continues its edge.
-
-    Returns:
-        ``(1, C, *S)`` on the fixed grid.
-
-    Notes:
-        Differentiable in M, t and the moving pixels. Coordinates are computed in float64.
-    """
-    points = fixed.grid.points(dtype=torch.float64, device=moving.data.device)
-    there = moving.to_grid(affine(fixed.to_world(points)))
-    return sample(moving.data, there, moving.grid, mode=mode, outside=outside)
-
-
-def _descend(levels: list[Level], candidates: list[Candidate], kind: str, settings: AlignmentSettings) -> Candidate:
-    """Climb all levels; the last candidate, the files' geometry, has been tried and joins again on the second level."""
-    moves = generators(kind, levels[0].dim)
-    *candidates, still = candidates
-    for index, level in enumerate(levels):
+def _optimise_levels(
+    objectives: list[AffineObjective], candidates: list[Candidate], kind: str, settings: AlignmentSettings
+) -> Candidate:
+    """Return the most similar candidate after all levels; the last one, the files' geometry, joins on the second."""
+    moves = generators(kind, objectives[0].dim)
+    *candidates, identity = candidates
+    for index, objective in enumerate(objectives):
         if index == 1 or not candidates:
-            candidates = [*candidates, still]
-        if index >= _CONTEST:
+            candidates = [*candidates, identity]
+        if index >= _LEVELS_OF_SEVERAL:
             candidates = candidates[:1]  # the most similar on the level before
-        near = _NEAREST if level is levels[-1] else _NEAR
-        candidates = [c for c in climbed(level, candidates, moves, settings.steps, near) if c.value > -math.inf]
+        shortest = _SHORTEST_AT_LAST if objective is objectives[-1] else _SHORTEST
+        found = optimised(objective, candidates, moves, settings.steps, shortest)
+        candidates = [candidate for candidate in found if candidate.value > -math.inf]
     if not candidates:
         raise ComputationError(
             "align: no start brings enough of the images together; check that they show the same, or lower min_overlap"
@@ -220,103 +146,98 @@ def _descend(levels: list[Level], candidates: list[Candidate], kind: str, settin
     return candidates[0]
 
 
-def _valued(level: Level, candidate: Candidate) -> Candidate:
-    return replace(candidate, value=float(level.values(candidate.map.unsqueeze(0))[0]))
-
-
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _warnings(level: Level, best: Candidate, found: Found, names: tuple[str, str]) -> tuple[str, ...]:
+def _warnings(
+    objective: AffineObjective, best: Candidate, found: SearchResult, names: tuple[str, str]
+) -> tuple[str, ...]:
     """Return sentences about a mirror image, a change of size, little overlap."""
     fixed, moving = names
-    said = []
+    sentences = []
     if found.mirrored:
-        said.append(
+        sentences.append(
             f"{moving} looks like a mirror image of {fixed}: mirrored it would fit clearly better; check the "
             "directions in both headers, or flip it and align again"
         )
-    lengths = torch.linalg.svdvals(best.map[:-1, :-1])
-    if float(lengths.min()) < _LENGTHS[0] or float(lengths.max()) > _LENGTHS[1]:
-        said.append(
-            f"the alignment changes lengths by factors from {float(lengths.min()):.2g} to {float(lengths.max()):.2g}; "
+    longest, *_, shortest = torch.linalg.svdvals(best.map[:-1, :-1]).tolist()
+    if shortest < _LENGTH_FACTORS[0] or longest > _LENGTH_FACTORS[1]:
+        sentences.append(
+            f"the alignment changes lengths by factors from {shortest:.2g} to {longest:.2g}; "
             f"check the spacing of {fixed} and {moving}"
         )
-    shared = float(level.values(best.map.unsqueeze(0))[1])
-    if shared < _LITTLE_OVERLAP:
-        said.append(f"{fixed} and {moving} share only {shared:.0%} of the smaller one; check the result")
-    return tuple(said)
+    overlap = float(objective.values(best.map.unsqueeze(0))[1])
+    if overlap < _LITTLE_OVERLAP:
+        sentences.append(f"{fixed} and {moving} share only {overlap:.0%} of the smaller one; check the result")
+    return tuple(sentences)
 
 
 def _prepared(
     fixed: tuple[Image, Image | None], moving: tuple[Image, Image | None], settings: AlignmentSettings
-) -> tuple[Masked, Masked]:
-    """Return both images grey, cropped to their masks, with the bulk of their intensities between 0 and 1."""
+) -> tuple[MaskedImage, MaskedImage]:
+    """Return both images grey, cropped to their masks, with most of their intensities between 0 and 1."""
     if fixed[0].grid.dim != moving[0].grid.dim:
         kinds = f"{fixed[0].name} is {fixed[0].grid.dim}D but {moving[0].name} is {moving[0].grid.dim}D"
         raise InputError(f"{kinds}; give two images of the same dimension")
-    pair = [_weighted(luminance(image), mask).cropped(_MARGIN) for image, mask in (fixed, moving)]
-    ranges = [_range(part) for part in pair]
-    if on_one_scale(settings.similarity):
-        ranges = [(min(r[0] for r in ranges), max(r[1] for r in ranges))] * len(pair)
-    first, second = (_scaled(part, *r) for part, r in zip(pair, ranges, strict=True))
+    pair = [_masked(luminance(image), mask).cropped(_MARGIN) for image, mask in (fixed, moving)]
+    scaled = to_common_scale(
+        (pair[0].image.data, pair[1].image.data),
+        (pair[0].weight, pair[1].weight),
+        jointly=needs_common_scale(settings.similarity),
+    )
+    first, second = (_filled(part.with_data(data.clamp(0, 1).float())) for part, data in zip(pair, scaled, strict=True))
     return first, second
 
 
-def _weighted(image: Image, mask: Image | None) -> Masked:
+def _filled(part: MaskedImage) -> MaskedImage:
+    """Return the image with new values where it has no weight: smoothing would spread the old ones."""
+    return part if part.weight is None else part.with_data(fill(part.image.data, part.weight))
+
+
+def _masked(image: Image, mask: Image | None) -> MaskedImage:
     require_registrable(image)
     if mask is None:
-        return Masked(image)
+        return MaskedImage(image)
     if mask.grid.dim != image.grid.dim:
         raise InputError(f"{mask.name} is {mask.grid.dim}D but {image.name} is {image.grid.dim}D; give a mask like it")
     inside = resample(replace(mask, data=(luminance(mask).data != 0).to(mask.data.dtype)), image, mode="nearest")
     if not bool(inside.any()):
         raise InputError(f"{mask.name} marks no voxel of {image.name}; check that it is the right mask")
-    return Masked(image, inside.to(image.data))
+    return MaskedImage(image, inside.to(image.data))
 
 
-def _range(part: Masked) -> tuple[float, float]:
-    """Return the 0.5 and 99.5 percentiles of what counts, or its extremes where these are equal."""
-    values = part.image.data if part.weight is None else part.image.data[part.weight > 0]
-    values = values.flatten()
-    values = values[:: max(1, len(values) // 2**18)]
-    low, high = (values.kthvalue(1 + round(share * (len(values) - 1))).values for share in (0.005, 0.995))
-    if high <= low:
-        low, high = part.image.data.min(), part.image.data.max()
-    return float(low), float(high)
+def _make_objectives(
+    fixed: MaskedImage, moving: MaskedImage, frame: NormalisedFrame, settings: AlignmentSettings, size: float = 1.0
+) -> list[AffineObjective]:
+    """Return the objectives of the levels, coarse to fine; voxels are twice as wide as those of the next level.
 
-
-def _scaled(part: Masked, low: float, high: float) -> Masked:
-    data = ((part.image.data - low) / (high - low)).clamp(0, 1)
-    return replace(part, image=replace(part.image, data=data.float())).filled()
-
-
-def _levels(fixed: Masked, moving: Masked, frame: Frame, settings: AlignmentSettings, size: float = 1.0) -> list[Level]:
-    """Return the levels, coarse to fine, each with twice the voxels' width of the next.
-
-    ``size`` is how much larger things are in the moving image: voxels larger by as much blur both images alike.
+    ``size`` is how much larger things are in the moving image: its voxels are larger by as much, to blur both alike.
     """
     voxel = min(fixed.image.grid.spacing)
     while math.prod(with_voxels(fixed.image.grid, voxel).shape) > settings.nodes_in(fixed.image.grid.dim):
-        voxel *= _FINER
-    levels = []
+        voxel *= _COARSER
+    objectives = []
     while True:
         fixed, moving = fixed.coarser(voxel), moving.coarser(voxel * size)
-        levels.insert(0, _level(fixed, moving, frame, settings))
+        objectives.insert(0, _make_objective(fixed, moving, frame, settings))
         voxel *= 2
         shape = fixed.image.grid.shape
-        if math.prod(shape) <= _COARSEST or with_voxels(fixed.image.grid, voxel).shape == shape:
-            return levels
+        if math.prod(shape) <= COARSEST_NODES or with_voxels(fixed.image.grid, voxel).shape == shape:
+            return objectives
 
 
-def _level(fixed: Masked, moving: Masked, frame: Frame, settings: AlignmentSettings) -> Level:
-    def compared(part: Masked) -> Masked:
-        return replace(part, image=replace(part.image, data=features(settings.similarity, part.image.data)))
+def _make_objective(
+    fixed: MaskedImage, moving: MaskedImage, frame: NormalisedFrame, settings: AlignmentSettings
+) -> AffineObjective:
+    """Return the objective of two images at one resolution."""
+
+    def compared(part: MaskedImage) -> MaskedImage:
+        return part.with_data(features(settings.similarity, part.image.data))
 
     def make(image: Tensor, grid: Grid) -> Similarity:
         if similarity_weights(settings.similarity).keys() == {"lncc"}:
-            return DetailCorrelation(image, settings.window_in(grid.dim))
+            return ForegroundLNCC(image, settings.window_in(grid.dim))
         return make_similarity(settings.similarity, image, settings.window_in(grid.dim), grid=grid)
 
-    return Level(compared(fixed), compared(moving), frame, make, settings.min_overlap)
+    return AffineObjective(compared(fixed), compared(moving), frame, make, settings.min_overlap)

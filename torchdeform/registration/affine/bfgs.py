@@ -1,4 +1,4 @@
-"""Climbing a similarity over a group of maps: BFGS in the frame that moves along, many starts at once."""
+"""BFGS on a group of maps: many starts at once, each step in coordinates that move with the map."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,8 +12,8 @@ from torchdeform.registration.affine.lie import exponential
 _LONGEST = 2.0
 
 
-class Hill(Protocol):
-    """What is climbed: a value and its slope for every map, the metric in which the first step is taken."""
+class Objective(Protocol):
+    """What is maximised: value and derivative for every map, and the metric in which the first step is taken."""
 
     def evaluate(self, maps: Tensor) -> tuple[Tensor, Tensor]:
         """Return S ``(B,)`` and ∂S/∂ξ ``(B, D, D + 1)`` for maps ``(B, D + 1, D + 1)`` followed by x + ξ [x; 1]."""
@@ -23,14 +23,14 @@ class Hill(Protocol):
         """Return the matrix ``(B, D(D + 1), D(D + 1))`` whose quadratic form says what a move ξ does to the image."""
         ...
 
-    def reach(self, moves: Tensor) -> Tensor:
+    def longest_move(self, moves: Tensor) -> Tensor:
         """Return the longest displacement ``(B,)`` in voxels that moves ξ ``(B, D, D + 1)`` cause."""
         ...
 
 
 @dataclass
 class _State:
-    """Where every item stands. All tensors have the batch first."""
+    """Maps, values, slopes, inverse Hessians of −S, and whether those are still unscaled; the batch comes first."""
 
     maps: Tensor
     value: Tensor
@@ -40,33 +40,35 @@ class _State:
 
 
 @torch.no_grad()
-def climb(hill: Hill, maps: Tensor, moves: Tensor, *, steps: int, shortest: float = 0.005) -> tuple[Tensor, Tensor]:
-    """Return the maps after at most ``steps`` evaluations uphill, H ← H exp(Σ p_k L_k), and their values.
+def maximise(
+    objective: Objective, maps: Tensor, moves: Tensor, *, steps: int, shortest: float = 0.005
+) -> tuple[Tensor, Tensor]:
+    """Return the maps after at most ``steps`` steps H ← H exp(Σ p_k L_k) that raise the objective, and its values.
 
     Args:
-        hill: the similarity of one level.
+        objective: the similarity of one level.
         maps: starts ``(B, D + 1, D + 1)``, float64.
         moves: the moves allowed ``(P, D, D + 1)``, see `generators`.
         steps: evaluations at most.
-        shortest: step, in voxels of the level, below which an item stands still.
+        shortest: step in voxels of the level; an item is done when its step is shorter.
 
     Notes:
         Quasi-Newton: −S is modelled by κ·metric at first, with κ from the first step, then corrected by BFGS. A step
         that does not raise S is cut to a third. Items do not influence each other.
     """
     flat = moves.flatten(1)
-    value, slope = hill.evaluate(maps)
-    inverse = torch.linalg.inv(flat @ hill.metric(maps) @ flat.T)
+    value, slope = objective.evaluate(maps)
+    inverse = torch.linalg.inv(flat @ objective.metric(maps) @ flat.T)
     state = _State(maps, value, _project(slope, flat), inverse, torch.ones_like(value, dtype=torch.bool))
     fraction = torch.ones_like(value)
     for _ in range(steps):
-        step = _direction(hill, state, moves) * fraction.unsqueeze(1)
-        active = hill.reach(torch.einsum("bp,pij->bij", step, moves)) > shortest
+        step = _direction(objective, state, moves) * fraction.unsqueeze(1)
+        active = objective.longest_move(torch.einsum("bp,pij->bij", step, moves)) > shortest
         if not bool(active.any()):
             break
         trial = state.maps @ exponential(step, moves)
         value, slope = torch.full_like(state.value, -torch.inf), torch.zeros_like(slope)
-        value[active], slope[active] = hill.evaluate(trial[active])
+        value[active], slope[active] = objective.evaluate(trial[active])
         better = active & (value > state.value)
         state = _advance(state, better, (trial, value, _project(slope, flat)), step)
         fraction = torch.where(better, 1.0, fraction / 3)
@@ -77,11 +79,11 @@ def _project(slope: Tensor, flat: Tensor) -> Tensor:
     return slope.flatten(1) @ flat.T
 
 
-def _direction(hill: Hill, state: _State, moves: Tensor) -> Tensor:
-    """Return the quasi-Newton step; the first one of an item, whose scale is not known yet, moves one voxel."""
+def _direction(objective: Objective, state: _State, moves: Tensor) -> Tensor:
+    """Return the quasi-Newton step; the first step of an item moves one voxel, since its scale is not known yet."""
     step = (state.inverse @ state.slope.unsqueeze(2)).squeeze(2)
-    reach = hill.reach(torch.einsum("bp,pij->bij", step, moves)).clamp(min=1e-12)
-    scale = torch.where(state.fresh, 1 / reach, (_LONGEST / reach).clamp(max=1.0))
+    longest = objective.longest_move(torch.einsum("bp,pij->bij", step, moves)).clamp(min=1e-12)
+    scale = torch.where(state.fresh, 1 / longest, (_LONGEST / longest).clamp(max=1.0))
     return step * scale.unsqueeze(1)
 
 

@@ -1,16 +1,15 @@
-"""One level of an alignment: both images at one resolution, and the similarity as a function of the map."""
+"""The objective of an alignment: the similarity of two images at one resolution as a function of the map."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import product
 
 import torch
 from torch import Tensor
 
 from torchdeform.core.derivatives import derivative
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image
-from torchdeform.core.resampling import box_sum, restrict, with_voxels
+from torchdeform.core.image import Image, box_corners
+from torchdeform.core.resampling import restrict, with_voxels
 from torchdeform.core.warp import sample
 from torchdeform.metrics.similarity import Similarity
 from torchdeform.registration.affine.lie import homogeneous
@@ -18,15 +17,12 @@ from torchdeform.registration.affine.lie import homogeneous
 # Weight of plain displacement in the metric, so that flat images have one too.
 _DAMPING = 1e-3
 
-# Width in voxels from which painted-over voxels take their values, odd.
-_BRUSH = 5
-
 # Numbers that a batch of maps may hold at once.
 _CHUNK = 2**21
 
 
 @dataclass(frozen=True)
-class Masked:
+class MaskedImage:
     """An image and the weight of its voxels.
 
     Args:
@@ -37,25 +33,18 @@ class Masked:
     image: Image
     weight: Tensor | None = None
 
-    def coarser(self, voxel: float) -> "Masked":
+    def coarser(self, voxel: float) -> "MaskedImage":
         """Return both at voxels of about this width, smoothed so that nothing aliases; thicker voxels stay."""
         grid = self.image.grid
         coarse = with_voxels(grid, voxel)
         weight = None if self.weight is None else restrict(self.weight, grid, coarse)
-        return Masked(replace(self.image, data=restrict(self.image.data, grid, coarse), grid=coarse), weight)
+        return MaskedImage(replace(self.image, data=restrict(self.image.data, grid, coarse), grid=coarse), weight)
 
-    def filled(self) -> "Masked":
-        """Return the image with what has no weight painted over by its neighbours: smoothing would spread it."""
-        if self.weight is None:
-            return self
-        data, known = self.image.data, (self.weight > 0).to(self.image.data)
-        count = box_sum(known, _BRUSH)
-        near = box_sum(data * known, _BRUSH) / count.clamp(min=1)
-        mean = (data * known).sum() / known.sum() / data.shape[1]
-        paint = torch.where(count > 0, near, mean)
-        return replace(self, image=replace(self.image, data=torch.where(known > 0, data, paint)))
+    def with_data(self, data: Tensor) -> "MaskedImage":
+        """Return the image with other values ``(1, C, *S)``."""
+        return replace(self, image=replace(self.image, data=data))
 
-    def cropped(self, margin: int) -> "Masked":
+    def cropped(self, margin: int) -> "MaskedImage":
         """Return the box around all voxels with a weight, ``margin`` voxels wider; the whole without weights."""
         if self.weight is None:
             return self
@@ -67,20 +56,20 @@ class Masked:
         corner = torch.tensor([a * h for a, h in zip(first, grid.spacing, strict=True)], dtype=torch.float64)
         origin = tuple(self.image.to_world(corner.view(1, -1, 1)).flatten().tolist())
         image = replace(self.image, data=self.image.data[cut], grid=Grid(shape, grid.spacing), origin=origin)
-        return Masked(image, self.weight[cut])
+        return MaskedImage(image, self.weight[cut])
 
 
 @dataclass(frozen=True)
-class Frame:
+class NormalisedFrame:
     """Coordinates q = (x − centre) / radius of the world, so that shifts and turns are numbers of one size."""
 
     centre: Tensor
     radius: float
 
     @classmethod
-    def of(cls, image: Image) -> "Frame":
+    def of(cls, image: Image) -> "NormalisedFrame":
         """Return the frame in which the image's box has its centre at 0 and its corners at distance 1."""
-        corners = _corners(image)[0]
+        corners = image.to_world(box_corners(image.grid))[0]
         return cls(corners.mean(1), float((corners[:, -1] - corners[:, 0]).norm()) / 2)
 
     def from_world(self, points: Tensor) -> Tensor:
@@ -100,7 +89,7 @@ class Frame:
         return linear, self.centre + self.radius * shift - linear @ self.centre
 
 
-class Level:
+class AffineObjective:
     """The similarity of two images as a function of the map between them, at one resolution.
 
     Args:
@@ -108,7 +97,7 @@ class Level:
         moving: image that is sampled there, and its weight.
         frame: coordinates of the maps.
         make: returns the similarity to a fixed image ``(B, C, *S)`` on its grid.
-        least: overlap below which there is no similarity, 0 to 1.
+        min_overlap: with less overlap the similarity is −∞, 0 to 1.
 
     Notes:
         A map is a matrix ``(D + 1, D + 1)`` on [q; 1], float64 on the CPU. Weights are taken for constants in the
@@ -116,16 +105,21 @@ class Level:
     """
 
     def __init__(
-        self, fixed: Masked, moving: Masked, frame: Frame, make: Callable[[Tensor, Grid], Similarity], least: float
+        self,
+        fixed: MaskedImage,
+        moving: MaskedImage,
+        frame: NormalisedFrame,
+        make: Callable[[Tensor, Grid], Similarity],
+        min_overlap: float,
     ) -> None:
-        self.fixed, self.moving, self.frame, self.least = fixed, moving, frame, least
+        self.fixed, self.moving, self.frame, self.min_overlap = fixed, moving, frame, min_overlap
         grid = fixed.image.grid
         world = fixed.image.to_world(grid.points(dtype=torch.float64)).flatten(2)
         self.points = _with_ones(frame.from_world(world)[0]).to(fixed.image.data)
         self.voxel = grid.cell_volume ** (1 / grid.dim) / frame.radius
         self._place = frame.to_grid(moving.image)
         self._channels = _with_slopes(moving)
-        self._ends = _with_ones(frame.from_world(_corners(fixed.image))[0])
+        self._corners = _with_ones(frame.from_world(fixed.image.to_world(box_corners(grid)))[0])
         self._make, self._made = make, {}
 
     @property
@@ -139,7 +133,7 @@ class Level:
         return self._channels.shape[1]
 
     def evaluate(self, maps: Tensor) -> tuple[Tensor, Tensor]:
-        """Return S ``(B,)`` and ∂S/∂ξ ``(B, D, D + 1)`` for maps followed by q + ξ [q; 1], see `Hill`.
+        """Return S ``(B,)`` and ∂S/∂ξ ``(B, D, D + 1)`` for maps followed by q + ξ [q; 1], see `Objective`.
 
         With g = ∂S/∂warped and P the matrix from [q; 1] to the moving grid, ∂S/∂ξ = Pᵀ Σ g ∇moving [q; 1]ᵀ.
         """
@@ -147,7 +141,7 @@ class Level:
         value, derivative = self._similarity(len(maps)).evaluate(warped, weight)
         force = (derivative.unsqueeze(2) * slopes).sum(1).flatten(2)
         moment = (force @ self.points.T).double().cpu() / (force.shape[2] * warped.shape[1])
-        return self._judged(maps, value, weight)[0], place[:, :-1, :-1].transpose(1, 2) @ moment
+        return self._with_overlap(maps, value, weight)[0], place[:, :-1, :-1].transpose(1, 2) @ moment
 
     def values(self, maps: Tensor) -> tuple[Tensor, Tensor]:
         """Return S and the overlap, each ``(B,)``; any number of maps."""
@@ -156,12 +150,12 @@ class Level:
         for some in maps.split(size):
             _, warped, _, weight = self._warped(some)
             value, _ = self._similarity(len(some)).evaluate(warped, weight)
-            parts.append(torch.stack(self._judged(some, value, weight)))
-        value, shared = torch.cat(parts, dim=1)
-        return value, shared
+            parts.append(torch.stack(self._with_overlap(some, value, weight)))
+        value, overlap = torch.cat(parts, dim=1)
+        return value, overlap
 
     def metric(self, maps: Tensor) -> Tensor:
-        """Return Σ ∇warped∇warpedᵀ ⊗ [q; 1][q; 1]ᵀ / N and a little of the same without the image, see `Hill`."""
+        """Return Σ ∇warped∇warpedᵀ ⊗ [q; 1][q; 1]ᵀ / N and a little of the same without the image, see `Objective`."""
         place, _, slopes, weight = self._warped(maps)
         slopes = torch.einsum("bkj,bckn->bcjn", place[:, :-1, :-1].to(slopes), slopes.flatten(3))
         rows = (slopes.unsqueeze(3) * self.points).flatten(2, 3) * weight.flatten(2).sqrt().unsqueeze(1)
@@ -171,9 +165,9 @@ class Level:
         size = torch.diagonal(image, dim1=1, dim2=2).sum(1).clamp(min=1e-12) / torch.trace(plain)
         return image + _DAMPING * size.view(-1, 1, 1) * plain
 
-    def reach(self, moves: Tensor) -> Tensor:
-        """Return the longest displacement in voxels at the corners of the fixed image, see `Hill`."""
-        return (moves @ self._ends).norm(dim=1).amax(1) / self.voxel
+    def longest_move(self, moves: Tensor) -> Tensor:
+        """Return the longest displacement in voxels at the corners of the fixed image, see `Objective`."""
+        return (moves @ self._corners).norm(dim=1).amax(1) / self.voxel
 
     def _similarity(self, items: int) -> Similarity:
         """Return the similarity to that many copies of the fixed image."""
@@ -182,14 +176,14 @@ class Level:
             self._made[items] = self._make(image.data.expand(items, *image.data.shape[1:]), image.grid)
         return self._made[items]
 
-    def _judged(self, maps: Tensor, value: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    def _with_overlap(self, maps: Tensor, value: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """Return S, −∞ without enough overlap, and the overlap: 1 when the smaller image lies wholly in the other."""
         grids = self.fixed.image.grid, self.moving.image.grid
-        share = [1.0 if m.weight is None else float(m.weight.mean()) for m in (self.fixed, self.moving)]
+        weights = [1.0 if m.weight is None else float(m.weight.mean()) for m in (self.fixed, self.moving)]
         volume = torch.linalg.det(maps[:, :-1, :-1]).abs().clamp(min=1e-12)
-        most = (share[1] * grids[1].volume / grids[0].volume / volume).clamp(max=share[0])
-        shared = weight.flatten(1).double().mean(1).cpu() / most
-        return torch.where(shared < self.least, -torch.inf, value.double().cpu()), shared
+        most = (weights[1] * grids[1].volume / grids[0].volume / volume).clamp(max=weights[0])
+        overlap = weight.flatten(1).double().mean(1).cpu() / most
+        return torch.where(overlap < self.min_overlap, -torch.inf, value.double().cpu()), overlap
 
     def _warped(self, maps: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the matrices [q; 1] -> grid, moving at the mapped nodes, its slopes along its axes, and the weight."""
@@ -202,7 +196,7 @@ class Level:
         return place, values[:, :count], values[:, count:-1].unflatten(1, (count, grid.dim)), weight
 
 
-def _with_slopes(moving: Masked) -> Tensor:
+def _with_slopes(moving: MaskedImage) -> Tensor:
     """Return the image, its derivatives along its own axes, channel by channel, and its weight, as channels."""
     data, grid = moving.image.data, moving.image.grid
     slopes = torch.stack([derivative(data, grid, axis) for axis in range(grid.dim)], dim=2).flatten(1, 2)
@@ -212,9 +206,3 @@ def _with_slopes(moving: Masked) -> Tensor:
 
 def _with_ones(points: Tensor) -> Tensor:
     return torch.cat([points, torch.ones_like(points[:1])])
-
-
-def _corners(image: Image) -> Tensor:
-    """Return the corners of the image's box ``(1, D, 2^D)`` in the world, opposite ones first and last."""
-    ends = torch.tensor(list(product(*((0.0, side) for side in image.grid.extent))), dtype=torch.float64)
-    return image.to_world(ends.T.unsqueeze(0))

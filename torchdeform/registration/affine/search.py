@@ -1,4 +1,4 @@
-"""The coarse search of an alignment: all starts tried, the best climbed, mirror images looked at."""
+"""The coarse search of an alignment: many starts are tried, the best are optimised, mirror images are compared."""
 
 import itertools
 from collections.abc import Sequence
@@ -8,9 +8,28 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.grid import threads_worth
-from torchdeform.registration.affine.bfgs import climb
+from torchdeform.core.image import background, centre_of_mass
+from torchdeform.registration.affine.bfgs import maximise
 from torchdeform.registration.affine.lie import angle, generators, homogeneous, rotations
-from torchdeform.registration.affine.objective import Frame, Level, Masked
+from torchdeform.registration.affine.objective import AffineObjective, MaskedImage, NormalisedFrame
+
+# Starts that are optimised, mirrored ones among them, and those that go on to the next level.
+_OPTIMISED, _MIRRORED, _KEPT = 10, 3, 3
+
+# Maps nearer to each other than this (norm of the difference of their matrices) count as one.
+_SAME_START, _SAME_END = 0.3, 0.05
+
+# Shortest step in voxels here; the maps are optimised again.
+_SHORTEST = 0.05
+
+# A map that turns further than this many degrees has to be better than the others by this share.
+_TURNED, _TURNED_GAIN = 45.0, 1.1
+
+# A mirror image has to be better by this share before it is mentioned.
+_MIRROR_GAIN = 1.2
+
+# A ratio of sizes nearer to 1 than this is no reason to start with another scale.
+_SAME_SIZE = 1.1
 
 
 @dataclass(frozen=True)
@@ -19,7 +38,7 @@ class Start:
 
     Attributes:
         name: where it comes from.
-        map: matrix ``(D + 1, D + 1)`` in the coordinates of the `Frame`.
+        map: matrix ``(D + 1, D + 1)`` in the coordinates of the `NormalisedFrame`.
         turned: whether it is more than a shift and a scale.
     """
 
@@ -28,45 +47,13 @@ class Start:
     turned: bool
 
 
-# Starts that are climbed, mirrored ones among them, and those that go on to the next level.
-_CLIMBED = 10
-
-
-_MIRRORED = 3
-
-
-_KEPT = 3
-
-
-# Maps nearer to each other than this (norm of the difference of their matrices) count as one.
-_SAME_START = 0.3
-
-
-_SAME_END = 0.05
-
-
-# Voxels of the coarsest level within which a summit is found here; it is climbed again.
-_NEAR = 0.05
-
-
-# A map that turns further than this many degrees has to be better than the others by this share.
-_TURNED = 45.0
-
-
-_TURNED_GAIN = 1.1
-
-
-# A mirror image has to be better by this share before it is mentioned.
-_MIRROR_GAIN = 1.2
-
-
 @dataclass(frozen=True)
 class Candidate:
     """A map on its way to the alignment.
 
     Attributes:
         name: the start it comes from.
-        map: matrix ``(D + 1, D + 1)`` in the coordinates of the `Frame`.
+        map: matrix ``(D + 1, D + 1)`` in the coordinates of the `NormalisedFrame`.
         value: its similarity on the last level.
     """
 
@@ -76,13 +63,12 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Found:
-    """What the coarse search found.
+class SearchResult:
+    """The result of the coarse search.
 
     Attributes:
         candidates: the best maps, the best first.
-        mirror: how much better a mirrored map is than the best one, in its distance from what chance gives; 1 is
-            equally good.
+        mirror: merit of the best mirrored map over that of the best map, see `search`; 1 is equally good.
     """
 
     candidates: list[Candidate]
@@ -102,60 +88,63 @@ class Found:
         return self.mirror > _MIRROR_GAIN
 
 
-def climbed(
-    level: Level, candidates: Sequence[Candidate], moves: Tensor, steps: int, shortest: float
+def optimised(
+    objective: AffineObjective, candidates: Sequence[Candidate], moves: Tensor, steps: int, shortest: float
 ) -> list[Candidate]:
-    """Return the candidates after climbing a level, the most similar first."""
+    """Return the candidates after some steps of `maximise`, the most similar first."""
     starts = torch.stack([c.map for c in candidates])
-    with threads_worth(len(candidates) * level.fields, level.fixed.image.grid):
-        maps, values = climb(level, starts, moves, steps=steps, shortest=shortest)
+    with threads_worth(len(candidates) * objective.fields, objective.fixed.image.grid):
+        maps, values = maximise(objective, starts, moves, steps=steps, shortest=shortest)
     moved = [Candidate(c.name, m, float(v)) for c, m, v in zip(candidates, maps, values, strict=True)]
     return sorted(moved, key=lambda c: -c.value)
 
 
-def search(level: Level, kind: str, *, turn: bool, steps: int) -> Found:
-    """Return the best maps that starts at the files' geometry, the centres, the moments and rotations lead to.
+def search(objective: AffineObjective, kind: str, *, turn: bool, steps: int) -> SearchResult:
+    """Return the best maps found from the files' geometry, the centres, the moments, and rotations of them.
 
     Args:
-        level: the coarsest level.
+        objective: of the coarsest level.
         kind: ``translation`` to ``affine``; ``affine`` is searched as ``similarity``.
         turn: try rotations, and mirror images.
         steps: evaluations at most.
 
     Notes:
-        Merit is (S − median of S over all starts) · overlap: what is common to bad maps does not count, and a little
-        overlap is worth little. A map that turns by more than 45° is taken only when its merit is 1.1 times that of
-        all that turn less.
+        Maps are ranked by their merit (S − median of S over all starts) · overlap: what is common to bad maps does not
+        count, and a small overlap counts little. A map that turns by more than 45° needs 1.1 times the merit of all
+        that turn less.
     """
     rough = "similarity" if kind == "affine" else kind
-    bodies = body(level.fixed, level.frame), body(level.moving, level.frame)
-    plain, chance = _try(level, make_starts(*bodies, turn=turn, scale=rough == "similarity"), rough, steps, _CLIMBED)
-    if not turn or not plain:
-        return Found(_best(plain, chance))
-    flipped = make_starts(*bodies, turn=True, scale=rough == "similarity", mirror=True)
-    mirrored, _ = _try(level, flipped, rough, steps, _MIRRORED)
-    tops = [max((c.value - chance for c in side), default=0.0) for side in (mirrored, plain)]
-    return Found(_best(plain, chance), tops[0] / max(tops[1], 1e-12))
+    moments = [image_moments(part, objective.frame) for part in (objective.fixed, objective.moving)]
+    starts = make_starts(*moments, turn=turn, scale=rough == "similarity")
+    found, median = _try(objective, starts, rough, steps, _OPTIMISED)
+    if not turn or not found:
+        return SearchResult(_best(found, median))
+    flipped = make_starts(*moments, turn=True, scale=rough == "similarity", mirror=True)
+    mirrored, _ = _try(objective, flipped, rough, steps, _MIRRORED)
+    merit, rival = (max((c.value - median for c in some), default=0.0) for some in (found, mirrored))
+    return SearchResult(_best(found, median), rival / max(merit, 1e-12))
 
 
-def _try(level: Level, starts: list[Start], kind: str, steps: int, most: int) -> tuple[list[Candidate], float]:
-    """Return where the most promising starts lead, their merit as value plus what chance gives, and that."""
+def _try(
+    objective: AffineObjective, starts: list[Start], kind: str, steps: int, most: int
+) -> tuple[list[Candidate], float]:
+    """Return the maps found from the most promising starts, median + merit being their value, and the median."""
     maps = torch.stack([start.map for start in starts])
-    value, shared = level.values(maps)
+    value, overlap = objective.values(maps)
     finite = value.isfinite()
     if not bool(finite.any()):
         return [], 0.0
-    chance = float(value[finite].median())
-    merit = (value - chance) * shared.clamp(max=1.0)
+    median = float(value[finite].median())
+    merit = (value - median) * overlap.clamp(max=1.0)
     chosen = [Candidate(starts[i].name, maps[i], 0.0) for i in _promising(starts, maps, merit, most)]
-    ends = climbed(level, chosen, generators(kind, level.dim), steps, _NEAR)
-    value, shared = level.values(torch.stack([c.map for c in ends]))
-    merit = chance + (value - chance) * shared.clamp(max=1.0)
-    return [replace(c, value=float(m)) for c, m in zip(ends, merit, strict=True)], chance
+    ends = optimised(objective, chosen, generators(kind, objective.dim), steps, _SHORTEST)
+    value, overlap = objective.values(torch.stack([c.map for c in ends]))
+    merit = (value - median) * overlap.clamp(max=1.0)
+    return [replace(c, value=median + float(m)) for c, m in zip(ends, merit, strict=True)], median
 
 
 def _promising(starts: list[Start], maps: Tensor, merit: Tensor, most: int) -> list[int]:
-    """Return the starts to climb: all without a rotation, then the best of the others that are not alike."""
+    """Return the starts to optimise: all without a rotation, then the best of the others that are not alike."""
     chosen = [i for i, start in enumerate(starts) if not start.turned and merit[i] > -torch.inf]
     for i in merit.argsort(descending=True, stable=True).tolist():
         alone = all(float((maps[i] - maps[j]).norm()) >= _SAME_START for j in chosen)
@@ -164,11 +153,11 @@ def _promising(starts: list[Start], maps: Tensor, merit: Tensor, most: int) -> l
     return chosen
 
 
-def _best(candidates: list[Candidate], chance: float) -> list[Candidate]:
+def _best(candidates: list[Candidate], median: float) -> list[Candidate]:
     """Return a few candidates that differ, by merit, which counts for less where a map turns far."""
 
     def merit(candidate: Candidate) -> float:
-        gain = candidate.value - chance
+        gain = candidate.value - median
         return gain / _TURNED_GAIN if float(angle(candidate.map[:-1, :-1])) > _TURNED else gain
 
     kept: list[Candidate] = []
@@ -179,13 +168,9 @@ def _best(candidates: list[Candidate], chance: float) -> list[Candidate]:
     return kept
 
 
-# A ratio of sizes nearer to 1 than this is no reason to start with another scale.
-_SAME_SIZE = 1.1
-
-
 @dataclass(frozen=True)
-class Body:
-    """Where an image's content lies in the frame.
+class Moments:
+    """Where the content of an image is, in the coordinates of a frame.
 
     Attributes:
         mass: centre of what is not background ``(D,)``.
@@ -198,7 +183,7 @@ class Body:
     box: Tensor
 
 
-def body(part: Masked, frame: Frame) -> Body:
+def image_moments(part: MaskedImage, frame: NormalisedFrame) -> Moments:
     """Return the moments of |image − background|, or of the mask where there is one.
 
     Args:
@@ -206,22 +191,17 @@ def body(part: Masked, frame: Frame) -> Body:
         frame: coordinates of the result.
     """
     grid = part.image.grid
-    weight = _foreground(part.image.data) if part.weight is None else part.weight
-    weight = weight.double().flatten().cpu()
-    weight = weight / weight.sum()
+    data = part.image.data
+    weight = (data - background(data)).abs().mean(1, keepdim=True) + 1e-6 if part.weight is None else part.weight
+    weight = weight.double().cpu()
+    mass = frame.from_world(centre_of_mass(part.image, weight).unsqueeze(2))[0]
     points = frame.from_world(part.image.to_world(grid.points(dtype=torch.float64)).flatten(2))[0]
-    mass = points @ weight
-    away = points - mass.unsqueeze(1)
-    return Body(mass, (away * weight) @ away.T, (points[:, 0] + points[:, -1]) / 2)
+    away = points - mass
+    covariance = (away * (weight / weight.sum()).flatten()) @ away.T
+    return Moments(mass.squeeze(1), covariance, (points[:, 0] + points[:, -1]) / 2)
 
 
-def _foreground(data: Tensor) -> Tensor:
-    axes = range(2, data.dim())
-    faces = torch.cat([data.select(a, end).flatten(1) for a, end in itertools.product(axes, (0, -1))], dim=1)
-    return (data - faces.median()).abs().mean(dim=1) + 1e-6
-
-
-def make_starts(fixed: Body, moving: Body, *, turn: bool, scale: bool, mirror: bool = False) -> list[Start]:
+def make_starts(fixed: Moments, moving: Moments, *, turn: bool, scale: bool, mirror: bool = False) -> list[Start]:
     """Return the maps to try, those without a rotation first.
 
     Args:
@@ -256,7 +236,7 @@ def _about(name: str, linear: Tensor, start: Tensor, end: Tensor) -> Start:
     return Start(full, homogeneous(linear, end - linear @ start), turned)
 
 
-def _axes(fixed: Body, moving: Body) -> list[Tensor]:
+def _axes(fixed: Moments, moving: Moments) -> list[Tensor]:
     """Return the rotations that take principal axes to principal axes: 2 in 2D, 4 in 3D."""
     frames = [torch.linalg.eigh(b.covariance).eigenvectors for b in (fixed, moving)]
     signs = itertools.product((1.0, -1.0), repeat=len(fixed.box))

@@ -1,0 +1,94 @@
+"""The metric of a level: velocities are those of the least squares, whatever solves them, on the scale of a step."""
+
+import math
+
+import pytest
+import torch
+from nested_settings import settings_of
+
+from torchdeform.core.grid import Grid, per_item
+from torchdeform.fem.div_curl import solve_div_curl
+from torchdeform.fem.solver import SolverSettings
+from torchdeform.fem.weights import Weights
+from torchdeform.registration.velocity import (
+    VelocityMetric,
+    fold_barrier,
+    image_force,
+    max_norm,
+    normalise_step,
+    step_size,
+)
+
+GRIDS = [Grid((12, 14), (1.0, 0.5)), Grid((7, 8, 6), (0.5, 1.0, 0.8))]
+SETTINGS = settings_of(length_scale=(6.0, 3.0), weight_div=0.4)
+
+
+def field(grid: Grid, channels: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(channels)
+    return torch.randn(2, channels, *grid.shape, dtype=torch.float64, generator=generator)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_a_velocity_is_that_of_the_div_curl_least_squares(grid):
+    """K v = M force: the same as asking for the divergence and curl whose least squares have that load."""
+    alpha = field(grid, 1)
+    metric = VelocityMetric.of(grid, SETTINGS.metric, SETTINGS.solver, alpha, below=1)
+    length = 6.0 * grid.cell_volume ** (1 / grid.dim)
+    weights = Weights(0.4, 1.0, 0.4 / length**2)
+    assert metric.system.weights == weights
+    alpha = alpha - solve_div_curl(alpha, None, grid).incompatibility.view(-1, *[1] * (grid.dim + 1))
+    wanted = solve_div_curl(alpha, None, grid, weights=weights, solver=SolverSettings(method="cg", rtol=1e-12)).value
+    torch.testing.assert_close(metric.factor(metric.system.load(div=alpha)), wanted, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("method", ["cg", "assembled"])
+@pytest.mark.parametrize("grid", GRIDS)
+def test_every_solver_gives_the_same_direction(grid, method):
+    force, lowest = field(grid, grid.dim), torch.rand(2, 1, *grid.shape, dtype=torch.float64)
+    barrier, points = fold_barrier(lowest, 0.15), 0.1 * field(grid, grid.dim)
+    how = SolverSettings(method=method, preconditioner="jacobi", rtol=1e-12)
+    found = [
+        VelocityMetric.of(grid, SETTINGS.metric, solver, force).ascent(force, barrier, points)
+        for solver in (SolverSettings(), how)
+    ]
+    torch.testing.assert_close(found[0], found[1], rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_a_direction_has_no_unit_and_one_voxel(grid):
+    force = field(grid, grid.dim)
+    metric = VelocityMetric.of(grid, SETTINGS.metric, SETTINGS.solver, force)
+    v = metric.ascent(force)
+    torch.testing.assert_close(max_norm(v / grid.along(grid.spacing, v)), torch.ones(2, dtype=v.dtype))
+    torch.testing.assert_close(metric.ascent(1e-9 * force), v)
+    assert not normalise_step(torch.zeros_like(v), grid).any()
+    work = (v * metric.system.mass(force)).flatten(1).sum(1)  # it is a direction of ascent
+    assert (work > 0).all()
+
+
+def test_the_barrier_opens_where_cells_are_small():
+    lowest = torch.tensor([0.3, 0.15, 0.05, 0.01]).view(1, 1, 2, 2)
+    torch.testing.assert_close(fold_barrier(lowest, 0.15).flatten(), torch.tensor([0.0, 0.0, 2.0, 14.0]))
+    grid, small = GRIDS[0], torch.ones(1, 1, 12, 14, dtype=torch.float64)
+    small[0, 0, 6, 7] = 0.03
+    force = torch.zeros(1, 2, 12, 14, dtype=torch.float64)
+    v = VelocityMetric.of(grid, SETTINGS.metric, SETTINGS.solver, force).ascent(force, fold_barrier(small, 0.15))
+    assert v[0, 0, 8, 7] > 0 > v[0, 0, 4, 7]  # away from the small cell
+    assert v[0, 1, 6, 9] > 0 > v[0, 1, 6, 5]
+
+
+@pytest.mark.parametrize("by", ["auto", "convolution", "shifts"])
+@pytest.mark.parametrize("grid", GRIDS)
+def test_the_force_of_an_image_is_its_gradient(grid, by):
+    slope, image = field(grid, 2), grid.points(dtype=torch.float64)[:, :2].expand(2, -1, *grid.shape).clone()
+    force = image_force(slope, image, grid, by)
+    torch.testing.assert_close(force[:, :2], slope)
+    assert grid.dim == 2 or not force[:, 2].any()
+
+
+def test_steps_fall_to_a_tenth():
+    optimiser = settings_of(step_length=2.0).optimiser
+    assert step_size(optimiser, 0, 10) == 2.0
+    assert math.isclose(step_size(optimiser, 10, 10), 0.2)
+    assert math.isclose(step_size(optimiser, 5, 10), 1.1)
+    assert per_item(torch.ones(2), torch.ones(2, 1, 3, 3)).shape == (2, 1, 1, 1)

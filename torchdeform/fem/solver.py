@@ -1,0 +1,63 @@
+"""Which solver a div-curl system gets; no other place of the package makes one."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from torchdeform.errors import InputError, require_choice
+from torchdeform.fem.fast_transform import FastTransform, is_exact_for
+from torchdeform.fem.system import DivCurlSystem
+from torchdeform.solvers.base import LinearSolver
+from torchdeform.solvers.cg import ConjugateGradient, Jacobi
+
+Method = Literal["auto", "transform", "cg", "assembled"]
+Preconditioner = Literal["transform", "jacobi", "none"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverSettings:
+    """How the div-curl least squares are solved.
+
+    Args:
+        method: ``transform`` (direct, by fast sine and cosine transforms, where they are exact), ``cg`` (batched
+            conjugate gradients without a stored matrix), ``assembled`` (the same with the matrix, assembled as torch
+            sparse COO), or ``auto``: ``transform`` where it is exact, else ``cg``. All have the same answer.
+        preconditioner: of conjugate gradients: ``transform`` (the direct solver with mean weights; where it is exact
+            one step is enough), ``jacobi`` (the diagonal), ``none``.
+        rtol: solved when ‖load − K v‖ ≤ max(rtol ‖load‖, atol). None asks for 1e-5 in float32 and 1e-10 in float64.
+        atol: absolute tolerance on the residual.
+        max_steps: steps of conjugate gradients at most.
+
+    Raises:
+        InputError: an unknown name, or a number out of range.
+    """
+
+    method: Method = "auto"
+    preconditioner: Preconditioner = "transform"
+    rtol: float | None = None
+    atol: float = 0.0
+    max_steps: int = 1000
+
+    def __post_init__(self) -> None:
+        require_choice(self.method, get_args(Method), "solver")
+        require_choice(self.preconditioner, get_args(Preconditioner), "solver.preconditioner")
+        if (self.rtol or 0) < 0 or self.atol < 0 or self.max_steps < 0:
+            raise InputError("solver: rtol, atol and max_steps must not be negative")
+
+
+def solver_of(settings: SolverSettings | Method, system: DivCurlSystem) -> LinearSolver:
+    """Return the solver that the settings, or the name of a method, choose for a system.
+
+    Raises:
+        InputError: an unknown name; `FastTransform.init` refuses ``transform`` where it is not exact.
+    """
+    how = settings if isinstance(settings, SolverSettings) else SolverSettings(method=settings)
+    if how.method == "transform" or (how.method == "auto" and is_exact_for(system)):
+        return FastTransform(rtol=how.rtol, atol=how.atol)
+    preconditioners = {"transform": FastTransform(approximate=True), "jacobi": Jacobi(), "none": None}
+    return ConjugateGradient(
+        assembled=how.method == "assembled",
+        preconditioner=preconditioners[how.preconditioner],
+        rtol=how.rtol,
+        atol=how.atol,
+        max_steps=how.max_steps,
+    )

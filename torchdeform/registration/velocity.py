@@ -1,0 +1,116 @@
+"""From a force to a velocity: the least-squares metric of a level, and how far its flow goes in one step."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchdeform.core.derivatives import derivative
+from torchdeform.core.grid import Grid, per_item
+from torchdeform.fem.solver import SolverSettings, solver_of
+from torchdeform.fem.system import DivCurlSystem
+from torchdeform.fem.weights import Weights
+from torchdeform.registration.settings import MetricSettings, OptimiserSettings
+from torchdeform.solvers.base import Factor
+
+# The step falls to this share of itself over a level.
+LAST_STEP = 0.1
+
+# Weight of the divergence that opens up nearly folded places, against a force of 1 at its strongest.
+_BARRIER_WEIGHT = 3.0
+
+
+@dataclass(frozen=True)
+class VelocityMetric:
+    """The div-curl least squares as a metric: K v = load, w_zero = w_div / length².
+
+    Attributes:
+        system: K on the grid of the map.
+        factor: the solver made ready for it.
+        order: power of the metric, see `Factor`.
+    """
+
+    system: DivCurlSystem
+    factor: Factor
+    order: int = 1
+
+    @classmethod
+    def of(
+        cls, grid: Grid, settings: MetricSettings, solver: SolverSettings, like: Tensor, below: int = 0
+    ) -> "VelocityMetric":
+        """Return the metric of a level's grid that has so many finer levels below it."""
+        length = settings.length_at(below) * grid.cell_volume ** (1 / grid.dim)
+        weights = Weights(settings.weight_div, settings.weight_curl, settings.weight_div / length**2)
+        return cls.of_weights(grid, weights, solver, like, settings.order)
+
+    @classmethod
+    def of_weights(
+        cls, grid: Grid, weights: Weights, solver: SolverSettings, like: Tensor, order: int = 1
+    ) -> "VelocityMetric":
+        """Return the metric with these weights; nothing flows out of the box."""
+        system = DivCurlSystem(grid, weights, "slip")
+        return cls(system, solver_of(solver, system).init(system, like), order)
+
+    @property
+    def grid(self) -> Grid:
+        """The grid of velocities."""
+        return self.system.grid
+
+    def velocity(self, force: Tensor, div: Tensor | None = None) -> Tensor:
+        """Return v with K v = load of a force density ``(B, D, *S)`` and of a divergence ``(B, 1, *S)``."""
+        return self.factor(self.system.load(div=div, force=force), power=self.order)
+
+    def ascent(self, force: Tensor, barrier: Tensor | None = None, points: Tensor | None = None) -> Tensor:
+        """Return the velocity of steepest ascent, its longest move being one voxel.
+
+        Args:
+            force: force density of the images ``(B, D, *S)``, in any unit; it is scaled to 1 at its strongest.
+            barrier: divergence asked for ``(B, 1, *S)`` where the map is nearly folded, see `fold_barrier`.
+            points: load of the landmarks ``(B, D, *S)``, in the unit of the force.
+
+        Notes:
+            The load of points is smoothed by one power more, w_0 (M⁻¹K)⁻¹, which keeps its sum: what least squares
+            alone answer to a point, a logarithm in 2D and 1/r in 3D, has a peak there.
+        """
+        strongest = max_norm(force) if points is None else max_norm(force).maximum(max_norm(points))
+        scale = 1 / strongest.clamp(min=torch.finfo(force.dtype).tiny)
+        weights = self.system.weights
+        div = None if barrier is None else barrier * (_BARRIER_WEIGHT / weights.div)
+        v = self.velocity(force * per_item(scale, force), div)
+        if points is not None:
+            load = points * per_item(scale * (self.grid.cell_volume * weights.zero), points)
+            v = v + self.factor(load, power=self.order + 1)
+        return normalise_step(v, self.grid)
+
+
+def image_force(slope: Tensor, warped: Tensor, grid: Grid, by: str = "auto") -> Tensor:
+    """Return the force Σ_c slope_c ∇warped_c ``(B, D, *S)`` from N ∂S/∂warped and the warped image ``(B, C, *S)``."""
+    axes = [(slope * derivative(warped, grid, a, by=by)).sum(1, keepdim=True) for a in range(grid.dim)]
+    return torch.cat(axes, dim=1)
+
+
+def fold_barrier(lowest: Tensor, soft_determinant: float) -> Tensor:
+    """Return the divergence soft/J − 1 that opens a map up where its smallest determinant J ``(B, 1, *S)`` is below."""
+    return (soft_determinant / lowest - 1).clamp_(min=0)
+
+
+def normalise_step(v: Tensor, grid: Grid) -> Tensor:
+    """Return the velocity ``(B, D, *S)`` on the scale on which its longest move is one voxel; 0 stays 0."""
+    longest = max_norm(v / grid.along(grid.spacing, v))
+    return v / per_item(longest.clamp(min=torch.finfo(v.dtype).tiny), v)
+
+
+def max_norm(field: Tensor) -> Tensor:
+    """Return the largest |field| of each item ``(B,)``."""
+    return field.square().sum(1).flatten(1).amax(1).sqrt()
+
+
+def step_size(settings: OptimiserSettings, step: int, steps: int) -> float:
+    """Return the longest move in voxels in this step of so many, from 0."""
+    return settings.step_length * (1 - (1 - LAST_STEP) * step / max(steps, 1))
+
+
+def points_scale(weight: float, grid: Grid) -> float:
+    """Return what the load of landmarks is multiplied by to be in the unit of N ∂S/∂warped."""
+    return weight * math.prod(grid.shape)
