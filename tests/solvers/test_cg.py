@@ -6,7 +6,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rounding import assert_same_to_rounding
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
@@ -30,7 +29,11 @@ def spd(size: int, condition: float = 100.0, dtype: torch.dtype = torch.float64)
 
 
 def product(x: Tensor, matrix: Tensor) -> Tensor:
-    """Apply the matrix to every item, one product each."""
+    """Apply the matrix to every item, one product each, so that an item does not feel its batch.
+
+    To the last bit, as items of 8, 40 or so numbers in float64 start at multiples of 64 bytes in a batch as they do
+    alone: the kernel of a product may depend on that.
+    """
     return torch.stack([(matrix @ item.flatten()).view(item.shape) for item in x])
 
 
@@ -79,10 +82,9 @@ def test_a_batch_equals_its_items_one_by_one_with_a_hard_one_among_them():
         together = conjugate_gradient(lambda x: product(x, matrix), b, preconditioner=preconditioner)
         for i in range(len(b)):
             alone = conjugate_gradient(lambda x: product(x, matrix), b[i : i + 1], preconditioner=preconditioner)
-            terms = 40 * int(together.steps[i])  # of a product, in every step
-            assert_same_to_rounding(together.value[i], alone.value[0], terms, condition=1e4)
+            assert torch.equal(together.value[i], alone.value[0])
             assert together.steps[i] == alone.steps[0]
-            assert_same_to_rounding(together.residual[i], alone.residual[0], terms, condition=1e4, size=1.0)
+            assert together.residual[i] == alone.residual[0]
             assert together.status[i] is alone.status[0]
     assert len(set(together.steps.tolist())) > 2
 
@@ -155,7 +157,7 @@ def test_an_item_that_is_not_finite_is_nan_and_leaks_nowhere(bad):
     assert solution.status == (Status.CONVERGED, Status.NON_FINITE, Status.CONVERGED)
     assert bool(solution.value[1].isnan().all())
     assert int(solution.steps[1]) == 0
-    assert_same_to_rounding(solution.value[[0, 2]], clean.value[[0, 2]], terms=8 * 8, condition=100)
+    assert torch.equal(solution.value[[0, 2]], clean.value[[0, 2]])
     start = torch.zeros_like(b).index_fill(0, torch.tensor([2]), bad)
     assert conjugate_gradient(lambda x: product(x, matrix), b, x0=start).status[2] is Status.NON_FINITE
 
@@ -166,7 +168,7 @@ def test_an_operator_that_is_not_finite_on_one_item_leaks_nowhere():
     b = torch.randn(3, 8, dtype=torch.float64)
     solution = conjugate_gradient(lambda x: x * weights, b)
     assert solution.status == (Status.CONVERGED, Status.NON_FINITE, Status.CONVERGED)
-    assert_same_to_rounding(solution.value[[0, 2]], b[[0, 2]], terms=8)
+    assert torch.equal(solution.value[[0, 2]], b[[0, 2]])
 
 
 def test_rounding_is_called_so_when_a_tolerance_is_out_of_reach():
