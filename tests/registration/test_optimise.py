@@ -56,7 +56,7 @@ def state_of(u: torch.Tensor, grid: Grid) -> levels.State:
 def test_a_step_follows_the_flow_of_its_velocity(method):
     grid = Grid((12, 14), (1.0, 0.5))
     v = 0.3 * torch.rand(1, 2, *grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    share, _, lowest = levels.fold_free_step(level_of(grid, method), state_of(torch.zeros_like(v), grid), v)
+    share, moved, lowest = levels.fold_free_step(level_of(grid, method), state_of(torch.zeros_like(v), grid), v)
     assert share.tolist() == [1.0]
     torch.testing.assert_close(moved, integrate(v, grid, steps=1, method=method))
     torch.testing.assert_close(lowest, one_sided_determinant(moved, grid))
