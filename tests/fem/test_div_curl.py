@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from rounding import assert_same_to_rounding, condition_of_a_solve, terms_of_a_solve
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
@@ -225,7 +226,9 @@ def test_a_batch_equals_its_items_one_by_one(settings, boundary):
         )
         assert together.status[i] is alone.status[0]
         assert together.steps[i] == alone.steps[0]
-        assert i == 2 or torch.equal(together.value[part], alone.value)
+        if i != 2:
+            terms, condition = terms_of_a_solve(grid), condition_of_a_solve(grid, 3.0)
+            assert_same_to_rounding(together.value[part], alone.value, terms, condition)
     assert together.status[2] is Status.NON_FINITE
     assert all(together.status[i].ok for i in (0, 1, 3))
     assert not together.value[1].any()
@@ -242,7 +245,7 @@ def test_what_is_left_out_is_zero_and_one_item_spreads():
         (solve_div_curl(div, curl[:1], grid), solve_div_curl(div, curl[:1].expand(2, -1, -1, -1), grid)),
     ]
     for a, b in same:
-        assert torch.equal(a.value, b.value)
+        assert_same_to_rounding(a.value, b.value, terms_of_a_solve(grid), condition_of_a_solve(grid))
     # Only boundary values: the field without divergence and curl that takes them.
     x = grid.points(dtype=torch.float64)
     still = torch.cat([x[:, 1:], x[:, :1]], dim=1)

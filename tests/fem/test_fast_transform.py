@@ -4,6 +4,7 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from rounding import assert_same_to_rounding, condition_of_a_solve, terms_of_a_solve
 from torch.autograd import gradcheck, gradgradcheck
 
 from torchdeform.core.grid import Grid
@@ -137,12 +138,14 @@ def test_long_axes_go_through_the_fft(device, monkeypatch):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("weights", [Weights(), Weights(2.0, 0.5, 0.1)])
-def test_a_batch_gives_its_items_bit_for_bit(weights, dtype, device):
+def test_a_batch_gives_its_items(weights, dtype, device):
     grid = Grid((6, 9, 7))
     solver = transform(grid, weights, dtype=dtype, device=device)
     load = torch.randn(3, 3, *grid.shape, dtype=dtype, device=device)
     together = solver(load)
-    assert all(torch.equal(together[i : i + 1], solver(load[i : i + 1])) for i in range(3))
+    for i in range(3):
+        alone = solver(load[i : i + 1])
+        assert_same_to_rounding(together[i : i + 1], alone, terms_of_a_solve(grid), condition_of_a_solve(grid, 4.0))
 
 
 def test_weights_may_differ_from_item_to_item():

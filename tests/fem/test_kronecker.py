@@ -3,6 +3,7 @@
 import pytest
 import torch
 from forms import DEVICES, WEIGHTS, close, element_values, random_field
+from rounding import assert_same_to_rounding
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
@@ -41,7 +42,7 @@ def test_the_matrix_is_a_sum_of_kronecker_products():
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_batch_gives_its_items_bit_for_bit(dtype, device, monkeypatch):
+def test_a_batch_gives_its_items(dtype, device, monkeypatch):
     monkeypatch.setattr(quadrature, "_SLAB", 100)
     grid = Grid((7, 7, 6), (0.7, 1.0, 1.4))
     v, varying = random_field(grid, batch=3).to(device, dtype), element_values(grid, batch=3).to(device, dtype)
@@ -49,4 +50,8 @@ def test_a_batch_gives_its_items_bit_for_bit(dtype, device, monkeypatch):
         together = apply_form(div_curl_form(3, weights), v, grid)
         for i in range(3):
             alone = weights.with_tensors(tuple(w[i : i + 1] for w in weights.tensors))
-            assert torch.equal(together[i : i + 1], apply_form(div_curl_form(3, alone), v[i : i + 1], grid))
+            one, want = together[i : i + 1], apply_form(div_curl_form(3, alone), v[i : i + 1], grid)
+            if not weights.tensors:
+                assert torch.equal(one, want)  # no product of matrices: every node is computed alike
+            # Components, corners of an element, its points, elements at a node.
+            assert_same_to_rounding(one, want, terms=3 * 8 * 8 * 8)

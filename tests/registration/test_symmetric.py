@@ -32,7 +32,9 @@ def test_swapping_the_images_inverts_the_map(shape, similarity):
         distance = voxels(apart, grid)
         assert distance.mean() < (0.1 if similarity == "mind" else 0.05)  # MIND bends small volumes most
         assert distance.flatten().quantile(0.9) < 0.15
-    assert torch.equal(there.levels[-1].similarity[-1], back.levels[-1].similarity[-1])  # mirrored to the last bit
+    # Mirrored but for rounding: products of matrices do not give an item the same bits at each place of a batch.
+    torch.testing.assert_close(there.levels[0].similarity[1], back.levels[0].similarity[1], rtol=0, atol=1e-5)
+    torch.testing.assert_close(there.levels[-1].similarity[-1], back.levels[-1].similarity[-1], rtol=0, atol=1e-4)
 
 
 def test_swapping_images_that_have_nothing_in_common_inverts_the_map():

@@ -5,6 +5,7 @@ import scipy.fft
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rounding import assert_same_to_rounding
 from torch.autograd import gradcheck, gradgradcheck
 
 from torchdeform.errors import InputError
@@ -86,11 +87,14 @@ def test_the_separable_transform_is_one_transform_per_axis(way, shape, dtype, de
     assert torch.equal(out, got)
 
 
-def test_a_batch_gives_its_items_bit_for_bit():
+def test_a_batch_gives_its_items():
     kinds = (("sine", "cosine"), ("cosine", "sine"))
     x = torch.randn(5, 2, 37, 23)
     together = separable_transform(x, kinds)
-    assert all(torch.equal(together[i : i + 1], separable_transform(x[i : i + 1], kinds)) for i in range(5))
+    for one, item in zip(together, x, strict=True):
+        alone = separable_transform(item[None], kinds)[0]
+        size = float(item.abs().sum() / alone.abs().max())  # no entry of the matrices is larger than 1
+        assert_same_to_rounding(one, alone, terms=37 + 23, condition=size)
 
 
 def test_strided_input_is_taken_as_it_looks():

@@ -79,11 +79,11 @@ def shared_parts(one: Mapping[str, str], other: Mapping[str, str]) -> dict[str, 
     return {key: value for key, value in one.items() if other.get(key) == value}
 
 
-def select(names: Sequence[str], wanted: str) -> list[str]:
-    """Return the names that equal ``wanted``, start with it and ``_``, or match it as a pattern (``sub-0*``)."""
+def select(names: Sequence[str], pattern: str) -> list[str]:
+    """Return the names that equal ``pattern``, start with it and ``_``, or match it (``sub-0*``)."""
     from fnmatch import fnmatchcase
 
-    return [name for name in names if name == wanted or name.startswith(f"{wanted}_") or fnmatchcase(name, wanted)]
+    return [name for name in names if name == pattern or name.startswith(f"{pattern}_") or fnmatchcase(name, pattern)]
 
 
 def _short(name: str) -> str:

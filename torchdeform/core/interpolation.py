@@ -175,7 +175,7 @@ _MODES: dict[str, Callable[[Tensor, Grid, float | None], Sampler]] = {
 }
 MODES = tuple(_MODES)
 
-# The mode that labels are carried with where nobody asks for another, and those that copy values.
+# The default mode for labels, and the modes that copy values.
 LABEL_MODE = "label"
 COPYING = ("nearest", LABEL_MODE)
 

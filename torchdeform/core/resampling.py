@@ -18,7 +18,7 @@ _ROWS = {"cpu": 32, "cuda": 256}
 # Matrices of no more entries than this are one block: a call costs more than the products with their zeros.
 _SMALL = 2**13
 
-# Standard deviations to which a Gaussian reaches.
+# A Gaussian is cut off at so many standard deviations.
 _REACH = 3
 
 
@@ -92,8 +92,8 @@ def interpolation(coarse: int, fine: int, like: Tensor) -> Banded | None:
 
     Args:
         coarse: number of nodes that are given.
-        fine: number of nodes wanted.
-        like: a tensor with the dtype and device wanted.
+        fine: number of nodes of the result.
+        like: a tensor with the dtype and device of the result.
     """
     return None if coarse == fine else banded(*_linear(coarse, fine), (fine, coarse), like)
 
@@ -131,9 +131,9 @@ def restriction(fine: int, coarse: int, blur: float, like: Tensor) -> Banded | N
 
     Args:
         fine: number of nodes that are given.
-        coarse: number of nodes wanted.
+        coarse: number of nodes of the result.
         blur: standard deviation in voxels of the coarse axis.
-        like: a tensor with the dtype and device wanted.
+        like: a tensor with the dtype and device of the result.
     """
     if coarse == fine:
         return None
@@ -147,10 +147,10 @@ def restriction(fine: int, coarse: int, blur: float, like: Tensor) -> Banded | N
     return banded(*flat, (coarse, fine), like)
 
 
-def _linear(given: int, wanted: int) -> tuple[Tensor, Tensor, Tensor]:
+def _linear(given: int, asked: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return rows, columns and values of linear interpolation from so many nodes of an interval to others."""
-    rows = torch.arange(wanted)
-    place = rows.double() * ((given - 1) / (wanted - 1))
+    rows = torch.arange(asked)
+    place = rows.double() * ((given - 1) / (asked - 1))
     left = place.long().clamp(max=given - 2)
     share = place - left
     return rows.repeat(2), torch.cat([left, left + 1]), torch.cat([1 - share, share])
@@ -164,7 +164,7 @@ def banded(rows: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]
         columns: whole numbers, near one another in rows that are.
         values: entries.
         shape: rows and columns of the matrix.
-        like: a tensor with the dtype and device wanted.
+        like: a tensor with the dtype and device of the result.
     """
     blocks, size = [], shape[0] if math.prod(shape) <= _SMALL else _ROWS.get(like.device.type, 256)
     for start in range(0, shape[0], size):
@@ -246,7 +246,7 @@ class Transfer:
     Args:
         fine: grid of the images.
         coarse: grid of the map, no finer along any axis.
-        like: a tensor with the dtype and device wanted.
+        like: a tensor with the dtype and device of the result.
     """
 
     fine: Grid
@@ -295,7 +295,7 @@ def pyramid_grids(grid: Grid, levels: int) -> list[Grid]:
 
     Args:
         grid: the finest grid.
-        levels: number of levels wanted.
+        levels: number of levels at most.
 
     Returns:
         Grids of the same box. Each level has about twice the spacing of the next, counted from the smallest spacing, so
@@ -331,7 +331,7 @@ def restrict(image: Tensor, grid: Grid, coarse: Grid) -> Tensor:
     Args:
         image: ``(B, C, *S)`` on ``grid``.
         grid: its grid.
-        coarse: the grid wanted.
+        coarse: the grid of the result.
     """
     counts = zip(grid.shape, coarse.shape, strict=True)
     return multiply(image, [restriction(many, few, _BLUR, image) for many, few in counts])
@@ -342,7 +342,7 @@ def prolong(u: Tensor, grid: Grid) -> Tensor:
 
     Args:
         u: ``(B, D, *S)`` in units of spacing.
-        grid: the grid wanted.
+        grid: the grid of the result.
     """
     if tuple(u.shape[2:]) == grid.shape:
         return u

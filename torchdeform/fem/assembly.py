@@ -12,7 +12,7 @@ from torchdeform.fem.elements import components, element_matrices
 from torchdeform.fem.form import Form
 
 # The neighbours of a node, itself among them, in the order of their numbers.
-_OFFSETS = {dim: list(product((-1, 0, 1), repeat=dim)) for dim in (2, 3)}
+_OFFSETS: dict[int, list[tuple[int, ...]]] = {dim: list(product((-1, 0, 1), repeat=dim)) for dim in (2, 3)}
 
 
 def assemble(form: Form, grid: Grid, device: torch.device | str = "cpu") -> Tensor:

@@ -23,7 +23,8 @@ class SolverSettings:
     Args:
         method: ``transform`` (direct, by fast sine and cosine transforms, where they are exact), ``cg`` (batched
             conjugate gradients without a stored matrix), ``assembled`` (the same with the matrix, assembled as torch
-            sparse COO, up to 1.8 million nodes in 2D and 270,000 in 3D; beyond, without it), or ``auto``: ``transform`` where it is exact, else ``cg``. All have the same answer.
+            sparse COO; beyond 1.8 million nodes in 2D and 270,000 in 3D without it), or ``auto``: ``transform`` where
+            it is exact, else ``cg``. All have the same answer.
         preconditioner: of conjugate gradients: ``transform`` (the direct solver with mean weights; where it is exact
             one step is enough), ``jacobi`` (the diagonal), ``none``.
         rtol: solved when ‖load − K v‖ ≤ max(rtol ‖load‖, atol). None asks for 1e-5 in float32 and 1e-10 in float64.

@@ -187,7 +187,7 @@ def _steps(series: Sequence[Slice]) -> NDArray[np.float64]:
 
 
 def _has_frames(series: Sequence[Slice]) -> bool:
-    """Return whether positions repeat on purpose: at different moments, or in half again as many files as positions."""
+    """Return whether positions repeat on purpose: at different times, or in 1.5 times as many files as positions."""
     again = [(one, two) for one, two in pairwise(_sorted(series)) if two.height - one.height <= _SAME]
     return any(one.moment != two.moment for one, two in again) or len(series) >= 1.5 * (len(_steps(series)) + 1)
 

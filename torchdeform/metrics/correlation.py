@@ -120,7 +120,7 @@ class LocalCrossCorrelation(Similarity):
         each divided by its number of voxels. ε = 1e-5 keeps flat regions finite: they count as not correlated.
         A mask weights the voxels of a window and the windows: E becomes the weighted mean.
         Box sums of 3 fields and the transpose of 3 a call; 3 more for a mask that is not the one of the call before.
-        With stride 3, as `register` has it with windows of 9, what lies between is a 27th in 3D, and maps are as good.
+        With stride 3, as in `register` with windows of 9, there are 27 times fewer windows in 3D, and maps are as good.
         Not differentiable, see `lncc`.
     """
 

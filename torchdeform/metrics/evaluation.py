@@ -87,7 +87,7 @@ def evaluate_images(
         fixed: the fixed image.
         affine: from the world of the fixed image to that of the moving one; None for the identity.
         u: displacement ``(1, D, *S)`` on the fixed grid, applied first.
-        labels: of both images, each in its own place.
+        labels: of both images, on any grid.
         points: landmarks of both in the world ``(1, D, n)``.
     """
     regions = labels and (resample(labels[0], fixed, mode="nearest"), labels[1])
@@ -160,7 +160,7 @@ def dice(fixed: Tensor, warped: Tensor, labels: tuple[int, ...]) -> Tensor:
     Args:
         fixed: labels ``(B, 1, *S)``.
         warped: the same shape.
-        labels: the labels looked at.
+        labels: those to compare.
 
     Returns:
         ``(B, L)``, NaN where neither image has the label.
@@ -181,12 +181,12 @@ def hausdorff(
     """Return the larger of both directed distances between the surfaces of every label.
 
     The directed distance from A to B is the percentile of the distances from A's surface voxels to the nearest ones of
-    B's. A surface voxel has a neighbour across a face that is not of the label, or lies at the edge of the image.
+    B's. A surface voxel has a neighbour across a face that is not of the label, or is at the edge of the image.
 
     Args:
         fixed: labels ``(B, 1, *S)``.
         warped: the same shape.
-        labels: the labels looked at.
+        labels: those to compare.
         grid: their grid.
         percentile: 95 by default; 100 gives the Hausdorff distance.
 
