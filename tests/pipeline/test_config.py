@@ -108,7 +108,7 @@ def test_unknown_names_get_the_nearest():
     with pytest.raises(InputError, match="did you mean 'fast'"):
         load_settings("fst")
     with pytest.raises(InputError, match=r"window = \{'size': 3\}"):
-        load_settings(overrides={"window.size": 3})
+        load_settings(overrides={"similarity.window.size": 3})
     with pytest.raises(InputError, match="did you mean 'similarity'"):
         load_settings(overrides={"similarty": "ssd"})
 

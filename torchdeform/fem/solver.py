@@ -1,7 +1,6 @@
 """Which solver a div-curl system gets; no other place of the package makes one."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 from torchdeform.errors import InputError, require_choice
 from torchdeform.fem.fast_transform import FastTransform, is_exact_for
@@ -12,8 +11,8 @@ from torchdeform.solvers.cg import ConjugateGradient, Jacobi
 # A matrix of more entries (see `DivCurlSystem.matrix_entries`) is not assembled: that would take more than 6 GB.
 LARGEST_MATRIX = 2**26
 
-Method = Literal["auto", "transform", "cg", "assembled"]
-Preconditioner = Literal["transform", "jacobi", "none"]
+METHODS = ("auto", "transform", "cg", "assembled")
+PRECONDITIONERS = ("transform", "jacobi", "none")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,20 +34,20 @@ class SolverSettings:
         InputError: an unknown name, or a number out of range.
     """
 
-    method: Method = "auto"
-    preconditioner: Preconditioner = "transform"
+    method: str = "auto"
+    preconditioner: str = "transform"
     rtol: float | None = None
     atol: float = 0.0
     max_steps: int = 1000
 
     def __post_init__(self) -> None:
-        require_choice(self.method, get_args(Method), "solver")
-        require_choice(self.preconditioner, get_args(Preconditioner), "solver.preconditioner")
+        require_choice(self.method, METHODS, "solver")
+        require_choice(self.preconditioner, PRECONDITIONERS, "solver.preconditioner")
         if (self.rtol or 0) < 0 or self.atol < 0 or self.max_steps < 0:
             raise InputError("solver: rtol, atol and max_steps must not be negative")
 
 
-def solver_of(settings: SolverSettings | Method, system: DivCurlSystem) -> LinearSolver:
+def solver_of(settings: SolverSettings | str, system: DivCurlSystem) -> LinearSolver:
     """Return the solver that the settings, or the name of a method, choose for a system.
 
     Raises:

@@ -208,8 +208,10 @@ def _whole_group(name: str, value: object) -> object:
     if name not in SHORT_FORMS:
         return value
     known = {field.name for field in fields(get_type_hints(RegistrationSettings)[name])}
-    weights = isinstance(value, Mapping) and not known & value.keys() and bool(MEASURES.keys() & value.keys())
-    return {SHORT_FORMS[name]: value} if weights or not isinstance(value, Mapping) else value
+    if not isinstance(value, Mapping):
+        return {SHORT_FORMS[name]: value}
+    weights = name == "similarity" and not known & value.keys() and (not value or MEASURES.keys() & value.keys())
+    return {SHORT_FORMS[name]: value} if weights else value
 
 
 def _merge(base: dict[str, Any], change: Mapping[str, Any]) -> None:
@@ -243,7 +245,7 @@ def _require_known(kind: Any, values: Mapping[str, Any], where: str, prefix: str
     known = [field.name for field in fields(kind)]
     for key, value in values.items():
         if key not in known:
-            raise InputError(f"{where}: there is no setting '{prefix}{key}'{_suggestion(key, known, prefix)}")
+            raise InputError(f"{where}: there is no setting '{prefix}{key}'{_suggestion(str(key), known, prefix)}")
         if not is_dataclass(hints[key]):
             continue
         if not isinstance(value, dict):
@@ -278,5 +280,6 @@ def _validate(values: dict[str, Any], sources: Mapping[str, str]) -> Registratio
     name = ".".join(map(str, first["loc"]))
     inside = [known for known in sources if known.startswith(f"{name}.") and known.rpartition(".")[2] in problem]
     where = next((sources[known] for known in (*inside, name, name.partition(".")[0]) if known in sources), "settings")
-    given = "" if isinstance(first["input"], dict) else f"{name} = {first['input']!r}: "
+    own = first["type"] == "value_error" and isinstance(first["input"], dict)  # of a whole group, with names in it
+    given = "" if own else f"{name} = {first['input']!r}: "
     raise InputError(f"{where}: {given}{problem}")
