@@ -31,7 +31,7 @@ from torchdeform.pipeline.config import (
     read_yaml_lines,
     to_yaml,
 )
-from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.settings import SHORT_FORMS, RegistrationSettings
 
 # Companions of an image by their keys here, with their names in a pair.
 COMPANIONS = {"labels": "labels", "masks": "mask", "points": "points"}
@@ -77,7 +77,19 @@ def _checked_expression(expression: str, name: str = "expression") -> str:
     return expression
 
 
-Overrides = Annotated[dict[str, Any], WithJsonSchema(TypeAdapter(RegistrationSettings).json_schema())]
+def _settings_schema() -> dict[str, Any]:
+    """Return the JSON Schema of settings with each group in its place, or the one value that stands for it."""
+    schema = TypeAdapter(RegistrationSettings).json_schema()
+    groups = schema.pop("$defs")
+    for name, field in schema["properties"].items():
+        if "$ref" in field:
+            group = groups[field.pop("$ref").rpartition("/")[2]]
+            short = [group["properties"][SHORT_FORMS[name]]] if name in SHORT_FORMS else []
+            field["anyOf"] = [group, *short]
+    return schema
+
+
+Overrides = Annotated[dict[str, Any], WithJsonSchema(_settings_schema())]
 Patterns = Annotated[
     tuple[Pattern, ...],
     BeforeValidator(_several),

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.diagnostics import Diagnosis, diagnose, inverse_error, smallest_determinant
-from torchdeform.core.flow import preload
 from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid, limit_threads
 from torchdeform.core.image import Image, resample
@@ -81,7 +80,6 @@ def register(
         ``symmetric`` two maps from a space between move against each other, and φ = φ_m ∘ φ_f⁻¹.
     """
     settings, guidance = config or RegistrationSettings(), guidance or Guidance()
-    preload()
     if isinstance(fixed, Image) and isinstance(moving, Image):
         return _register_images(fixed, moving, settings, guidance, affine, start, callback)
     if isinstance(fixed, Image) or isinstance(moving, Image):
