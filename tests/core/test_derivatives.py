@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -21,6 +22,7 @@ from torchdeform.core.derivatives import (
     divergence,
     jacobian,
     jacobian_determinant,
+    kernel_weights,
     map_jacobian,
 )
 from torchdeform.core.grid import Grid
@@ -192,3 +194,29 @@ def test_wrong_input_is_refused():
             function(u[:, :1], grid)
     with pytest.raises(InputError, match="derivative: field must have shape"):
         jacobian(u[..., :-1], grid)
+
+
+@UNTIMED
+@given(grids(), st.sampled_from(ORDERS), st.sampled_from([torch.float32, torch.float64]))
+def test_convolutions_and_shifted_sums_are_one_derivative(grid, order, dtype):
+    field = random_field(grid, 2, items=2).to(dtype)
+    for axis in range(grid.dim):
+        ways = [derivative(field, grid, axis, order=order, by=by) for by in ("shifts", "convolution", "auto")]
+        bound = 32 * torch.finfo(dtype).eps * float(field.abs().max()) / grid.spacing[axis]
+        for other in ways[1:]:
+            torch.testing.assert_close(ways[0], other, rtol=0, atol=bound)
+
+
+@pytest.mark.parametrize("grid", [Grid((6, 7), (0.5, 2.0)), Grid((5, 6, 7), (0.5, 2.0, 1.0))])
+def test_kernels_are_weights_of_convolutions(grid):
+    """What a network would do with them is the derivative at the inner nodes."""
+    field = random_field(grid, 1)
+    for order, axis in [(order, axis) for order in ORDERS for axis in range(grid.dim)]:
+        kernel = KERNELS[order][0]
+        weights = kernel_weights(kernel, axis, grid.dim, field, grid.spacing[axis])
+        inner = {2: F.conv2d, 3: F.conv3d}[grid.dim](field, weights)
+        margin = len(kernel) // 2
+        wanted = derivative(field, grid, axis, order=order).narrow(axis + 2, margin, grid.shape[axis] - 2 * margin)
+        torch.testing.assert_close(inner, wanted)
+    with pytest.raises(InputError, match="did you mean 'convolution'"):
+        derivative(field, grid, 0, by="convolutions")

@@ -1,6 +1,9 @@
 """Flows against closed forms: orders, inverses, boundaries, gradients."""
 
 import math
+import subprocess
+import sys
+from itertools import product
 
 import pytest
 import torch
@@ -11,7 +14,7 @@ from torch.autograd import gradcheck
 
 from torchdeform.core import flow
 from torchdeform.core.diagnostics import inverse_error
-from torchdeform.core.flow import OdeSolver, integrate, integrate_points
+from torchdeform.core.flow import TABLEAUX, OdeSolver, integrate, integrate_points, integrate_rate, runge_kutta
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import compose, max_voxels, sample, warp
 from torchdeform.errors import ComputationError, InputError
@@ -288,3 +291,56 @@ def test_a_velocity_that_is_not_finite_is_named():
     with pytest.raises(ComputationError, match="check the velocity for NaN"):
         integrate(v, grid, method="dopri5")
     assert integrate(v, grid).isnan().any()
+
+
+@pytest.mark.parametrize(("method", "dim", "steps"), list(product(TABLEAUX, (2, 3), (1, 3))))
+def test_the_tableaux_are_the_methods_of_torchdiffeq(method, dim, steps):
+    """To rounding, forwards and backwards in time, for a rate that changes with time."""
+    grid = Grid((7, 6, 5)[:dim], SPACING[:dim])
+    v, start = slip(grid, 2.0), 0.1 * slip(grid, 1.0, seed=1)
+
+    def rate(t, u):
+        return warp(v, u, grid) * (1 + t) ** 2 - 0.3 * u
+
+    for times in ((0.0, 1.0), (0.0, 0.4, 1.1), (0.5, -0.5)):
+        ours = runge_kutta(rate, start, times, TABLEAUX[method], steps)
+        theirs = integrate_rate(rate, start, times, grid, OdeSolver(method=method, steps=steps))
+        torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", TABLEAUX)
+def test_flows_are_traced_by_their_tableaux(monkeypatch, method):
+    """Where torch.compile looks on, torchdiffeq is not called, and the flow is the same, gradients too."""
+    grid = Grid((6, 7), (0.5, 1.0))
+    v = slip(grid, 1.0).requires_grad_()
+    plain = integrate(v, grid, steps=2, method=method)
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    monkeypatch.setattr(flow, "_torchdiffeq", lambda: pytest.fail("torchdiffeq was called"))
+    traced = integrate(v, grid, steps=2, method=method)
+    torch.testing.assert_close(traced, plain, rtol=1e-12, atol=1e-12)
+    grads = [torch.autograd.grad(u.square().sum(), v)[0] for u in (plain, traced)]
+    torch.testing.assert_close(*grads, rtol=1e-10, atol=1e-10)
+
+
+def test_torchdiffeq_is_whole_though_scipys_integrators_are_not_imported():
+    """Its ``scipy_solver`` works, and so does the module that a stand-in took the place of for a moment."""
+    code = (
+        "import sys, torch, torchdeform as td\n"
+        "td.integrate(torch.zeros(1, 2, 4, 4), td.Grid((4, 4)))\n"
+        "assert 'torchdiffeq' in sys.modules and 'scipy.integrate' not in sys.modules\n"
+        "from torchdiffeq import odeint\n"
+        "t = torch.tensor([0.0, 1.0])\n"
+        "y = odeint(lambda t, y: -y, torch.ones(1), t, method='scipy_solver', options={'solver': 'LSODA'})\n"
+        "assert abs(float(y[-1]) - 0.367879) < 1e-4, y\n"
+        "import scipy.integrate\n"
+        "assert abs(scipy.integrate.quad(lambda x: x, 0, 1)[0] - 0.5) < 1e-9\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_stand_in_gives_way_to_the_module():
+    """As another thread finds it that imports scipy.integrate at that moment."""
+    stand_in = flow._StandIn("scipy.integrate")
+    assert stand_in.quad(lambda x: 2 * x, 0, 1)[0] == pytest.approx(1.0)
+    assert not isinstance(sys.modules["scipy.integrate"], flow._StandIn)
