@@ -48,7 +48,7 @@ UPSAMPLING = {2: "bilinear", 3: "trilinear"}
 
 @dataclass(frozen=True)
 class Settings:
-    """What a file in configs/ holds."""
+    """The settings in a file of configs/."""
 
     data: str
     shape: tuple[int, ...]

@@ -1,4 +1,4 @@
-"""What mkdocs does beside its plugins: links to files of the project outside docs, and the help texts of the shell.
+"""Two additions to mkdocs: links to files of the project outside docs, and the help texts of the shell.
 
 `on_page_markdown` is called by mkdocs for each page, see ``hooks`` in mkdocs.yml.
 """
@@ -39,9 +39,9 @@ def on_page_markdown(markdown: str, /, *, page: Page, config: MkDocsConfig, file
 
 def help_texts() -> str:
     """Return what ``torchdeform VERB --help`` prints, a section a verb."""
-    from torchdeform.cli.main import HELP
+    from torchdeform.cli.main import VERBS
 
-    sections = (f"## {name}\n\n{HELP[name].summary}\n\n```text\n{_help(name)}\n```" for name in HELP)
+    sections = (f"## {name}\n\n{verb.summary}\n\n```text\n{_help(name)}\n```" for name, verb in VERBS.items())
     return "\n\n".join(sections)
 
 

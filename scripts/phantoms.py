@@ -27,8 +27,8 @@ def brains(out: Path) -> None:
     _write(out / "fixed.nii.gz", brain.clamp(min=0), grid, origin=here)
     _write(out / "fixed_labels.nii.gz", labels * (labels < 4), grid, kind="int16", origin=here)
     _write(out / "moving.nii.gz", td.warp(brain.clamp(min=0), u, grid), grid, origin=there)
-    carried = torch.cat([td.warp((labels == k).float(), u, grid) for k in range(5)], dim=1).argmax(1, keepdim=True)
-    _write(out / "moving_labels.nii.gz", carried * (carried < 4), grid, kind="int16", origin=there)
+    warped = torch.cat([td.warp((labels == k).float(), u, grid) for k in range(5)], dim=1).argmax(1, keepdim=True)
+    _write(out / "moving_labels.nii.gz", warped * (warped < 4), grid, kind="int16", origin=there)
 
 
 def lungs(out: Path) -> None:

@@ -53,6 +53,7 @@ from .registration.settings import (
     DiscreteSettings,
     RegistrationSettings,
 )
+from .registration.template import AveragingSettings, Template, build_template
 from .solvers.base import Solution, Status
 
 __version__: str
@@ -61,6 +62,7 @@ __all__ = [
     "Affine",
     "Alignment",
     "AlignmentSettings",
+    "AveragingSettings",
     "ComputationError",
     "DeformationSettings",
     "Diagnosis",
@@ -80,6 +82,7 @@ __all__ = [
     "Solution",
     "SolverSettings",
     "Status",
+    "Template",
     "TorchdeformError",
     "Transform",
     "Weights",
@@ -87,6 +90,7 @@ __all__ = [
     "average_maps",
     "ball_monitor",
     "box_monitor",
+    "build_template",
     "compose",
     "curl",
     "curvature_monitor",

@@ -2,12 +2,12 @@
 
 Usage: python scripts/benchmarks/cohort.py overhead|kill|dask|broken [--pairs N] [--folder DIR]
 
-overhead  time per pair beyond its registration, and memory of the process that keeps the books, on pairs of 64²
-kill      the same, that process killed ten times at random moments, then resumed: the outcome beside an undisturbed one
-dask      two worker processes of a Dask cluster, one killed in the middle: the outcome beside that of the local engine
+overhead  time per pair beyond its registration, and memory of the main process, on pairs of 64²
+kill      the same, that process killed ten times at random moments, then resumed: compared with an undisturbed run
+dask      two worker processes of a Dask cluster, one killed in the middle: compared with the local engine
 broken    one pair in twenty broken, in ten ways: every other is done, each of these has its sentence
 
-Exits with 1 if what must hold does not.
+Exits with 1 if a check fails.
 """
 
 import argparse
@@ -43,7 +43,7 @@ COHORT = """\
 out: out
 pairs: {{table: {{file: pairs.csv}}}}
 preset: fast
-settings: {{align: none, similarity: ssd, length: 8, steps: [5, 3]}}
+settings: {{align: none, similarity: ssd, metric: {{length_scale: 8}}, optimiser: {{steps: [5, 3]}}}}
 device: cpu
 engine: {engine}
 """
@@ -129,7 +129,7 @@ def outputs(out: Path) -> dict[str, str]:
 
 
 def content(path: Path) -> bytes:
-    """What a file holds; records without seconds, HDF5 without the times of writing that it keeps."""
+    """The content of a file; records without seconds, HDF5 without the times of writing that it keeps."""
     if path.suffix == ".json":
         return json.dumps(timeless(json.loads(path.read_bytes())), sort_keys=True).encode()
     if path.suffix == ".h5":

@@ -33,10 +33,7 @@ from torchdeform.deformation.versions import (  # noqa: E402
     track_moving_monitor,
 )
 from torchdeform.fem import SolverSettings, Weights, solve_div_curl  # noqa: E402
-from torchdeform.fem.assembly import assemble, constrain_matrix  # noqa: E402
-from torchdeform.fem.boundary import fixed_unknowns  # noqa: E402
-from torchdeform.fem.form import div_curl_form  # noqa: E402
-from torchdeform.fem.operator import assemble_load  # noqa: E402
+from torchdeform.fem.system import DivCurlSystem  # noqa: E402
 
 WAYS: tuple[VelocityName, ...] = ("direct", "poisson", "div_curl")
 VERSIONS = {1: grid_from_initial_monitor, 2: grid_from_target_monitor}
@@ -134,7 +131,7 @@ def fold_rows(grids: Sequence[Grid]) -> Iterable[list[str]]:
 
 
 def drift_rows(sizes: Sequence[int]) -> Iterable[list[str]]:
-    """Yield the errors of Version 3 at the last of 20 times beside those of Version 2 for that monitor."""
+    """Yield the errors of Version 3 at the last of 20 times, and those of Version 2 for that monitor."""
     times = [k / 19 for k in range(20)]
 
     def moving(t: float) -> Monitor:
@@ -169,14 +166,14 @@ def solvers(grid: Grid) -> dict[str, Callable[[], object]]:
 
     alpha = 1 - ring()(grid.points(dtype=torch.float64))
     alpha = alpha - mean_value(alpha, grid)
-    form, fixed = div_curl_form(grid.dim, Weights()), fixed_unknowns("slip", grid)
-    sparse = constrain_matrix(assemble(form, grid), fixed)
+    system = DivCurlSystem(grid, Weights())
+    sparse = system.matrix()
     matrix = coo_matrix((sparse.values().numpy(), sparse.indices().numpy()), shape=tuple(sparse.shape)).tocsr()
-    load = assemble_load(form[:1], alpha, grid).masked_fill(fixed, 0).flatten().numpy()
-    by_cg = SolverSettings(solver="cg", rtol=RTOL)
+    load = system.free(system.load(div=alpha)).flatten().numpy()
+    by_cg = SolverSettings(method="cg", rtol=RTOL)
     ways = {
         "torchdeform, transform": lambda: solve_div_curl(alpha, None, grid),
-        "torchdeform, CG with transform": lambda: solve_div_curl(alpha, None, grid, settings=by_cg),
+        "torchdeform, CG with transform": lambda: solve_div_curl(alpha, None, grid, solver=by_cg),
         "scipy CG": lambda: cg(matrix, load, rtol=RTOL),
         "scipy spsolve": lambda: spsolve(matrix.tocsc(), load),
     }

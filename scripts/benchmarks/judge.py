@@ -28,12 +28,12 @@ def judge(pair: Pair, positions: Positions) -> dict[str, float]:
 
 
 def overlap(fixed_path: Path, moving_path: Path, positions: Positions) -> dict[str, float]:
-    """Return the mean Dice over the labels that both files have, those of moving carried to the nearest voxel."""
+    """Return the mean Dice over the labels that both files have, those of moving warped to the nearest voxel."""
     first = _first_channel(sitk.ReadImage(str(fixed_path)))
     moving = sitk.ReadImage(str(moving_path))
-    carried = nearest(moving, positions)
+    warped = nearest(moving, positions)
     common = (set(np.unique(first)) & set(np.unique(_first_channel(moving)))) - {0}
-    both = [(first == label, carried == label) for label in common]
+    both = [(first == label, warped == label) for label in common]
     return {"dice": mean(2 * float((a & b).sum()) / float(a.sum() + b.sum()) for a, b in both)}
 
 

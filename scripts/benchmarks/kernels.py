@@ -1,4 +1,4 @@
-"""Bytes per second of the kernels that a registration lives on, beside a plain copy of the displacement field.
+"""Bytes per second of the main kernels of a registration, compared with a plain copy of the displacement field.
 
     python scripts/benchmarks/kernels.py [--quick] [--threads N]
 
@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import date
+from functools import partial
 from statistics import median
 from time import perf_counter
 
@@ -21,9 +22,11 @@ from machine import describe_machine
 from torch import Tensor
 
 import torchdeform as td
+from torchdeform.core.derivatives import derivative
 from torchdeform.core.diagnostics import one_sided_determinant
 from torchdeform.fem import Weights
-from torchdeform.fem.fast_transform import TransformSolver
+from torchdeform.fem.fast_transform import FastTransform
+from torchdeform.fem.system import DivCurlSystem
 from torchdeform.metrics.similarity import make_similarity
 
 _SHAPES = ((128, 128, 128), (1024, 1024))
@@ -54,13 +57,16 @@ def kernels(grid: td.Grid, device: str) -> Iterator[Kernel]:
     target, dim = torch.empty_like(u), grid.dim
     yield Kernel("copy of the displacement", lambda: target.copy_(u), 2 * dim)
     for name, curl in (("div-curl solve, equal weights", 1.0), ("div-curl solve, w_curl = 3 w_div", 3.0)):
-        solver = TransformSolver(grid, Weights(div=1.0, curl=curl, zero=_LENGTH**-2), "slip", device=device)
-        yield Kernel(name, lambda solver=solver: solver.solve(load), 2 * dim)
+        system = DivCurlSystem(grid, Weights(div=1.0, curl=curl, zero=_LENGTH**-2), "slip")
+        yield Kernel(name, partial(FastTransform().init(system, load), load), 2 * dim)
     yield Kernel("warp of one channel", lambda: td.warp(moving, u, grid), dim + 2)
     similarity = make_similarity("lncc", fixed, 9, grid=grid)
     yield Kernel("LNCC and its derivative, window 9", lambda: similarity.evaluate(moving), 3)
     yield Kernel("one-sided determinant", lambda: one_sided_determinant(u, grid), dim + 1)
     yield Kernel("composition of two maps", lambda: td.compose(u, load, grid), 3 * dim)
+    for by in ("shifts", "convolution"):
+        differences = partial(derivative, moving, grid, dim - 1, by=by)
+        yield Kernel(f"differences of one channel by {by}", differences, 2)
 
 
 def _smooth(grid: td.Grid, channels: int, device: str) -> Tensor:

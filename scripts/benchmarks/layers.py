@@ -169,7 +169,7 @@ def compare(part: str) -> None:
 
 
 def augmentation() -> None:
-    """Print the time of 32 images of 256², ours beside kornia's."""
+    """Print the time of 32 images of 256², ours and kornia's."""
     import kornia
 
     image = torch.rand(32, 1, 256, 256, device=DEVICE)

@@ -1,4 +1,4 @@
-"""Peak memory of registrations from files to files, beside what `torchdeform.pipeline.memory.footprint` says.
+"""Peak memory of registrations from files to files, and the estimate of `torchdeform.pipeline.memory.footprint`.
 
 Each case runs in a process of its own: python scripts/benchmarks/memory.py [--quick]
 """
@@ -57,7 +57,7 @@ def run(case: Case) -> int:
     coarse = torch.rand(1, channels, *[n // 8] * dim)
     mode = {2: "bilinear", 3: "trilinear"}[dim]
     data = torch.nn.functional.interpolate(coarse, size=(n,) * dim, mode=mode)
-    choices = ["--device=cpu", "--quiet", *(f"--set={setting}" for setting in ("steps=[1, 1, 2]", *settings))]
+    choices = ["--device=cpu", "--quiet", *(f"--set={setting}" for setting in ("optimiser.steps=[1, 1, 2]", *settings))]
     with tempfile.TemporaryDirectory() as folder:
         names = [Path(folder) / f"{name}.nrrd" for name in ("fixed", "moving")]
         for name, shift in zip(names, (0, 1), strict=True):

@@ -420,7 +420,7 @@ _FIREANTS_MODULES = ("fireants.io", "fireants.registration.affine", "fireants.re
 _DIPY_MODULES = ("dipy.align.imaffine", "dipy.align.imwarp", "dipy.align.metrics", "dipy.align.transforms", "nibabel")
 
 TOOLS: dict[str, Tool] = {
-    "unregistered": Tool("simpleitk", ("SimpleITK",), "the images as they lie", _stay),
+    "unregistered": Tool("simpleitk", ("SimpleITK",), "the images as the files place them", _stay),
     "torchdeform": _torchdeform("default"),
     "torchdeform_fast": _torchdeform("fast"),
     "torchdeform_accurate": _torchdeform("accurate"),

@@ -2,9 +2,9 @@
 
     python scripts/benchmarks/peers.py --sets mouse_brain_3d --tools torchdeform greedy ants_syn --json peers.json
 
-Each run is a process of its own on two cores with two threads. The tools take turns pair by pair, so that a machine
-that drifts is fair to all. What is there in the JSON file already is not run again, so a long benchmark can be made in
-pieces, and printed without running anything (``--print``).
+Each run is a process of its own on two cores with two threads. The tools take turns pair by pair, so that changes
+of the machine's speed affect all alike. Runs that are in the JSON file are not done again, so a long benchmark can be
+made in pieces, and printed without running anything (``--print``).
 
 Clock. Every file is first made an image of one channel of float32, without compression (colours as their luminance),
 the same files for all. *Start-up* runs from the start of the interpreter until the tool is imported. *Seconds* run from
@@ -13,7 +13,7 @@ images or labels, draws, or judges within them; ours finds the inverse and the c
 always does. *GiB* is the peak of the process at that moment.
 
 Judgement. A map is read off as positions of the fixed voxels, by the tool's own resampler or from the field it wrote
-(see `peer_tools`). Labels are carried by one nearest-neighbour code for all. Folds are those of the whole map.
+(see `peer_tools`). Labels are warped by one nearest-neighbour code for all. Folds are those of the whole map.
 """
 
 import argparse
@@ -255,10 +255,10 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--sets", nargs="+", default=list(SETS), choices=list(SETS))
     parser.add_argument("--tools", nargs="+", default=list(TOOLS), choices=list(TOOLS))
     parser.add_argument("--pairs", type=int, help="at most so many of each set")
-    parser.add_argument("--json", type=Path, help="file of all runs; what it holds is not run again")
+    parser.add_argument("--json", type=Path, help="file of all runs; runs that it has are not done again")
     parser.add_argument("--again", nargs="+", default=[], choices=list(TOOLS), help="run these again all the same")
     parser.add_argument("--retry", action="store_true", help="run again what failed")
-    parser.add_argument("--print", action="store_true", help="only print the table of what the file holds")
+    parser.add_argument("--print", action="store_true", help="only print the table of the runs in the file")
     parser.add_argument("--no-masks", action="store_true", help="keep masks to ourselves")
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="for the tools that can choose")
     parser.add_argument("--threads", type=int, default=2)

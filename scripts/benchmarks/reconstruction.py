@@ -28,10 +28,7 @@ from torchdeform.core.warp import max_voxels
 from torchdeform.deformation.prescribed import PrescribedSolution, from_jacobian_and_curl
 from torchdeform.deformation.reconstruction import reconstruct
 from torchdeform.fem import SolverSettings, Weights, solve_div_curl
-from torchdeform.fem.assembly import assemble, constrain_matrix
-from torchdeform.fem.boundary import fixed_unknowns
-from torchdeform.fem.form import div_curl_form
-from torchdeform.fem.operator import assemble_load
+from torchdeform.fem.system import DivCurlSystem
 
 # Unknowns beyond which the factors of a sparse direct solver outgrow the memory of a desktop.
 DIRECT_LIMIT = 25_000
@@ -135,9 +132,9 @@ def solves(nodes: int, rtol: float = 1e-8) -> None:
     div = div - (div * grid.quadrature(dtype=torch.float64)).sum() / grid.volume
     print(f"\nDiv-curl solve, {nodes}³ × 3 unknowns, slip, float64, relative residual {rtol:g}")
     row("", "seconds", "steps", "over transform", "over its CG")
-    settings = SolverSettings(solver="cg", rtol=rtol)
+    by_cg = SolverSettings(method="cg", rtol=rtol)
     direct, fast = timed(lambda: solve_div_curl(div, rotation, grid), 3)
-    iterative, slower = timed(lambda: solve_div_curl(div, rotation, grid, settings=settings), 3)
+    iterative, slower = timed(lambda: solve_div_curl(div, rotation, grid, solver=by_cg), 3)
     row("transform", f"{fast:.3f}", "direct", "1", "")
     row("CG preconditioned by the transform", f"{slower:.3f}", str(int(iterative.steps)), f"{slower / fast:.1f}", "1")
     for name, (value, seconds, steps) in others(div, rotation, grid, rtol):
@@ -156,9 +153,9 @@ def others(div: Tensor, rotation: Tensor, grid: Grid, rtol: float):
     """Yield the name, solution, time and steps of other solvers on the assembled matrix."""
     sparse = import_module("scipy.sparse")
     linalg = import_module("scipy.sparse.linalg")
-    form, fixed = div_curl_form(grid.dim, Weights()), fixed_unknowns("slip", grid)
-    load = assemble_load(form, torch.cat([div, rotation], dim=1), grid).masked_fill(fixed, 0)
-    matrix, seconds = timed(lambda: constrain_matrix(assemble(form, grid), fixed))
+    system = DivCurlSystem(grid, Weights())
+    load = system.free(system.load(div=div, curl=rotation))
+    matrix, seconds = timed(system.matrix)
     index, size = matrix.indices().numpy(), matrix.shape
     csr = sparse.csr_matrix((matrix.values().numpy(), (index[0], index[1])), shape=size)
     row(f"(assembly, {csr.nnz / 1e6:.1f} M entries)", f"{seconds:.2f}")

@@ -1,4 +1,4 @@
-"""Overlap, folds and time of `register` on real images, beside SimpleITK's diffeomorphic demons in the same run.
+"""Overlap, folds and time of `register` and of SimpleITK's diffeomorphic demons, on real images in the same run.
 
 Usage: python scripts/benchmarks/registration.py [DATA] [--sets heart_2d mindboggle_2d mouse_brain_3d brain_morph_2d]
 
@@ -106,7 +106,7 @@ def demons(case: Case) -> Tensor:
 
 
 def judge(case: Case, u: Tensor) -> dict[str, float]:
-    """Overlap of the labels carried by u, what is left of the squared difference, folds, smallest determinant."""
+    """Overlap of the labels warped by u, what is left of the squared difference, folds, smallest determinant."""
     grid = td.Grid(tuple(case.fixed.shape[2:]))
     moved = td.warp(case.moving_labels, u, grid, mode="nearest")
     left = (td.warp(case.moving, u, grid) - case.fixed).square().sum()

@@ -6,8 +6,8 @@ Two tensors of smooth random values are registered with one step on each level b
 that the finest level decides. Seconds are those of `register`, with the inverse map and the certificate at its end;
 "µs a step" is what one step of the finest level takes per voxel. Memory is the peak of the process (of the device with
 CUDA) less what it held when everything was imported and a small pair had been registered, in float32 numbers per
-voxel; the two images and the results are within it. What must hold: 40 floats a voxel, 12 GiB at 8192². Exits with 1
-where it does not.
+voxel; the two images and the results are included. The limits: 40 floats a voxel, 12 GiB at 8192². Exits with 1
+where one is broken.
 """
 
 import argparse
@@ -41,7 +41,9 @@ def run(shape: Shape, device: str, preset: str, similarity: str | None) -> dict[
 
     import torchdeform as td
 
-    choices = {"steps": list(_STEPS), "tolerance": 0.0} | ({"similarity": similarity} if similarity else {})
+    choices: dict[str, object] = {"optimiser.steps": list(_STEPS), "optimiser.tolerance": 0.0}
+    if similarity:
+        choices["similarity"] = similarity
     settings = td.load_settings(preset, overrides=choices)
     td.register(*_pair((24,) * len(shape), device), settings)
     before, start = _held(device), perf_counter()
@@ -107,7 +109,7 @@ def row(shape: Shape, found: dict[str, Any]) -> str:
 
 
 def complaints(shape: Shape, found: dict[str, Any]) -> Iterator[str]:
-    """Yield what must hold and does not; small grids say little of memory per voxel."""
+    """Yield the limits that are broken; small grids say little of memory per voxel."""
     if "failed" in found:
         return
     floats, size = found["bytes"] / 4 / math.prod(shape), "×".join(map(str, shape))

@@ -1,4 +1,4 @@
-"""How near a template comes to the image whose warps it is made of: prints the tables of docs/templates.md.
+"""How close a template is to the image whose warps it is made of: prints the tables of docs/templates.md.
 
     python scripts/benchmarks/template.py [--quick] [--rounds 3]
     python scripts/benchmarks/template.py --picture docs/templates.png
@@ -158,7 +158,7 @@ def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> Non
 
 def main() -> None:
     """Print all tables."""
-    parser = argparse.ArgumentParser(description="How near a template comes to the image whose warps it is made of.")
+    parser = argparse.ArgumentParser(description="How close a template is to the image whose warps it is made of.")
     parser.add_argument("--quick", action="store_true", help="the small image only")
     parser.add_argument("--rounds", type=int, default=3, help="rounds at most")
     parser.add_argument("--picture", type=Path, help="draw this picture only")

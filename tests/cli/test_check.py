@@ -64,7 +64,7 @@ def test_the_verb_warns_and_draws(run, tmp_path):
         (["fixed.nii.gz", "nothing.nii.gz"], 2, "error: nothing.nii.gz is constant"),
         (["fixed.nii.gz", "absent.nii.gz"], 2, "absent.nii.gz does not exist"),
         (["fixed.nii.gz", "far.nrrd", "--fixed-mask", "absent.nii.gz"], 2, "absent.nii.gz does not exist"),
-        (["fixed.nii.gz", "far.nrrd", "--out", "picture.jpg"], 2, "let its name end in .png"),
+        (["fixed.nii.gz", "far.nrrd", "--out", "picture.jpg"], 2, "give a name that ends in .png"),
         (["fixed.nii.gz", "far.nrrd", "--align", "afine"], 2, "did you mean 'affine'?"),
     ],
 )

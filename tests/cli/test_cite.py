@@ -45,4 +45,4 @@ def test_wrong_records_are_one_sentence(tmp_path, capsys, text, message):
 def test_a_record_and_settings_do_not_go_together(tmp_path, capsys):
     (tmp_path / "result.json").write_text('{"settings": {}}', encoding="utf-8")
     assert torchdeform(["cite", str(tmp_path / "result.json"), "--preset", "fast"]) == 2
-    assert "leave --preset" in capsys.readouterr().err
+    assert "leave out --preset" in capsys.readouterr().err

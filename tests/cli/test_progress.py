@@ -38,4 +38,4 @@ def test_a_terminal_gets_a_bar_with_counts_and_rate(capsys, monkeypatch):
         progress._progress.refresh()
     err = capsys.readouterr().err
     assert "c failed" in err
-    assert "3/4, 1 failed, 40.0 a min" in err
+    assert "3/4, 1 failed, 40.0 per min" in err

@@ -10,7 +10,7 @@ import torch
 import typer
 
 from torchdeform.cli import main as cli
-from torchdeform.cli.transforms import VERBS
+from torchdeform.cli import transforms
 from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Transform
 from torchdeform.core.warp import invert
@@ -20,6 +20,7 @@ from torchdeform.io.points import Points, read_points, write_points
 from torchdeform.io.transforms import read_transform, write_transform
 
 DIMS = [2, 3]
+VERBS = {name: getattr(transforms, name) for name in ("apply", "points", "invert", "compose", "jacobian")}
 
 
 def run(*arguments):
@@ -238,11 +239,11 @@ def test_what_is_read_is_never_replaced(volumes, capsys):
         (["apply", "transform.h5", "moving.nrrd"], "--out"),
         (["points", "transform.h5", "no.csv", "--out", "o.csv"], "no.csv does not exist"),
         (["points", "transform.h5", "points.csv", "--out", "o.xls"], "no ending that points are written with"),
-        (["points", "transform.h5", "flat.csv", "--out", "o.csv"], "flat.csv holds points of 2D, but 3D is needed"),
+        (["points", "transform.h5", "flat.csv", "--out", "o.csv"], "flat.csv holds 2D points, but 3D is needed"),
         (["invert", "transform.h5", "--out", "o.png"], "no ending that transforms are written with"),
         (["invert", "transform.h5", "--out", "o.mat"], "hold affine maps only"),
         (["invert", "transform.h5", "--out", "o.nii.gz"], "needs a grid"),
-        (["compose", "u.nrrd", "--out", "o.h5"], "two transforms at least"),
+        (["compose", "u.nrrd", "--out", "o.h5"], "at least two transforms"),
         (["compose", "u.nrrd", "flat.mat", "--out", "o.h5"], "one dimension throughout"),
         (["jacobian", "affine.mat", "--out", "o.nrrd"], "give --reference IMAGE"),
     ],
@@ -274,7 +275,7 @@ def test_a_folder_without_permission_is_named(volumes, capsys):
 DIRECTIONS = {
     "apply": ["onto the grid of the fixed image", "Images go from moving to fixed", "points from fixed to moving"],
     "points": ["Points go from fixed to moving", "brings the moving image to the fixed one"],
-    "invert": ["takes points from moving to fixed", "images from fixed to moving"],
+    "invert": ["maps points from moving to fixed", "images from fixed to moving"],
     "compose": ["points go through FIRST, then SECOND", "images the other way"],
     "jacobian": ["Points go from fixed to moving", "moving volume over fixed volume"],
 }

@@ -10,12 +10,12 @@ from nested_settings import changed
 
 from torchdeform.cohort.journal import JOURNAL, Journal, Record
 from torchdeform.cohort.plan import Job
-from torchdeform.cohort.task import DONE, FAILED, Report
+from torchdeform.cohort.task import DONE, FAILED, PairReport
 from torchdeform.errors import InputError
 from torchdeform.pipeline.register import PairFiles
 from torchdeform.registration.settings import RegistrationSettings
 
-REPORT = Report(DONE, "", 1.5, 4, 0, {"folds": 0, "dice_after": 0.9}, ("warped.png", "result.json"))
+REPORT = PairReport(DONE, "", 1.5, 4, 0, {"folds": 0, "dice_after": 0.9}, ("warped.png", "result.json"))
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_what_is_recorded_is_read_again(tmp_path):
 
 def test_the_last_line_of_a_pair_counts(tmp_path):
     with Journal(tmp_path) as journal:
-        journal.record(Record("a", "1", Report(FAILED, "why")))
+        journal.record(Record("a", "1", PairReport(FAILED, "why")))
         journal.record(Record("a", "2", REPORT))
     assert records(tmp_path) == {"a": Record("a", "2", REPORT)}
     assert len((tmp_path / JOURNAL).read_text(encoding="utf-8").splitlines()) == 2
@@ -79,7 +79,7 @@ def test_lines_that_make_no_sense_are_skipped(tmp_path, line):
 
 
 def test_two_runs_of_one_folder_are_refused(tmp_path):
-    with Journal(tmp_path), pytest.raises(InputError, match="another run is at work"):
+    with Journal(tmp_path), pytest.raises(InputError, match="another run is working"):
         Journal(tmp_path)
     with Journal(tmp_path):
         pass
@@ -171,7 +171,7 @@ def test_a_record_is_one_line_of_json_on_the_disk(tmp_path, monkeypatch):
     synced = []
     monkeypatch.setattr("torchdeform.cohort.journal.os.fsync", lambda file: synced.append(os.fstat(file).st_size))
     with Journal(tmp_path) as journal:
-        journal.record(Record("a", "1", Report(FAILED, "line one\nline two")))
+        journal.record(Record("a", "1", PairReport(FAILED, "line one\nline two")))
     text = (tmp_path / JOURNAL).read_text(encoding="utf-8")
     assert json.loads(text)["sentence"] == "line one\nline two"
     assert synced[-1] == len(text)

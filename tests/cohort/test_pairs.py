@@ -55,7 +55,7 @@ def test_each_to_a_member_of_its_group(touch, cohort_of):
     *found, lonely = pair_specs(cohort_of(f"pairs: {{pattern: {{{text}}}}}\n"))
     assert _pairs(found) == [(_session(1, s), _session(k, s)) for s in ("01", "02") for k in (2, 10)]
     assert (lonely.name, lonely.files) == ("sub-03", {})
-    assert "0 of its 1 images have session 1, and one must" in lonely.problem
+    assert "0 of its 1 images have session 1, not one" in lonely.problem
 
 
 def test_all_to_a_template_but_itself(touch, cohort_of):
@@ -92,7 +92,7 @@ def test_a_mask_that_cannot_be_told_is_a_problem_of_its_pair(touch, cohort_of):
     touch(["1.png", "2.png", "3.png", "m1a.tif", "m2a.tif", "m2b.tif", "m3a.tif"])
     found = pair_specs(cohort_of("pairs: {pattern: {files: '{n}.png', masks: 'm{n}*.tif', pairing: all}}\n"))
     assert [bool(pair.problem) for pair in found] == [True, False, True]
-    assert "m2*.tif must match one file, and 2 files match" in found[0].problem
+    assert "m2*.tif must match one file, but 2 files match" in found[0].problem
 
 
 def test_a_regular_expression_finds_images_too(touch, cohort_of):
@@ -108,7 +108,7 @@ def test_nothing_found_is_refused(cohort_of):
         pair_specs(cohort_of("pairs: {pattern: {files: 'nothing*.png', pairing: all}}\n"))
     with pytest.raises(InputError, match="names no pairs"):
         pair_specs(cohort_of("device: cpu\n"))
-    with pytest.raises(InputError, match="comes to no pair at all"):
+    with pytest.raises(InputError, match="gives no pair at all"):
         pair_specs(cohort_of("pairs: {list: []}\n"))
 
 
@@ -152,14 +152,14 @@ def test_tables(cohort_of, tmp_path, monkeypatch, name, separator):
         ("fixed,movng\n", "line 1: there is no column 'movng'; did you mean 'moving'?"),
         ("fixed\n", "line 1: the column 'moving' is missing"),
         ("", "line 1: the column 'fixed' is missing"),
-        ("fixed,moving,fixed\n", "line 1: the column 'fixed' stands there twice"),
-        ("fixed,moving\na.png\n", "line 2: it has 1 cells and the first line 2"),
+        ("fixed,moving,fixed\n", "line 1: the column 'fixed' occurs twice"),
+        ("fixed,moving\na.png\n", "line 2: it has 1 cells but the first line 2"),
         ("fixed,moving\na.png,b.png,c.png\n", "line 2: it has 3 cells"),
         ("fixed,moving\na.png,b.png\n,b.png\n", "line 3: fixed is empty"),
         ("fixed,moving,name\na.png,b.png,../x\n", "line 2: a name has letters"),
         ("fixed,moving\na.png,$NOWHERE_SET/b\n", "line 2: the environment variable NOWHERE_SET"),
         ("fixed,moving,settings.window\na,b,[\n", "line 2: --set window"),
-        ("fixed,moving\n", "comes to no pair at all"),
+        ("fixed,moving\n", "gives no pair at all"),
     ],
 )
 def test_wrong_tables(cohort_of, tmp_path, text, sentence):

@@ -5,7 +5,7 @@ from cohort_files import BIDS
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchdeform.cohort.patterns import fill, find, literal, only, part_names
+from torchdeform.cohort.patterns import fill_parts, find, literal, part_names, single_file
 from torchdeform.errors import InputError
 
 
@@ -38,25 +38,25 @@ def test_patterns_are_those_of_a_shell(touch, pattern, names):
 def test_a_part_may_be_limited(touch):
     folder = touch(["s1.png", "s1_label.png", "sx.png"])
     assert [one.parts for one in find(f"{folder}/s{{n}}.png", {"n": "[0-9]+"})] == [{"n": "1"}]
-    with pytest.raises(InputError, match="makes no regular expression"):
+    with pytest.raises(InputError, match="is no regular expression"):
         find(f"{folder}/s{{n}}.png", {"n": "(?P<n>x)"})
 
 
 @given(st.text(alphabet="ab*?[]{}!-.", min_size=1, max_size=8))
 def test_literal_means_the_text_itself(text):
-    assert only(f"/{literal(text)}").as_posix() == f"/{text}" or text.strip(".") == ""
+    assert single_file(f"/{literal(text)}").as_posix() == f"/{text}" or text.strip(".") == ""
     assert part_names(literal(text)) == ()
 
 
 @given(st.text(alphabet="ab*?[{}", min_size=1, max_size=6))
 def test_what_is_filled_in_is_taken_literally(text):
-    assert only(fill("/x{part}.png", {"part": text})).as_posix() == f"/x{text}.png"
+    assert single_file(fill_parts("/x{part}.png", {"part": text})).as_posix() == f"/x{text}.png"
 
 
 def test_one_file_must_match(touch):
     folder = touch(["a1.png", "a2.png"])
-    assert only(f"{folder}/a1*").name == "a1.png"
-    with pytest.raises(InputError, match="must match one file, and 2 files match"):
-        only(f"{folder}/a*")
-    with pytest.raises(InputError, match="must match one file, and no file matches"):
-        only(f"{folder}/b*")
+    assert single_file(f"{folder}/a1*").name == "a1.png"
+    with pytest.raises(InputError, match="must match one file, but 2 files match"):
+        single_file(f"{folder}/a*")
+    with pytest.raises(InputError, match="must match one file, but no file matches"):
+        single_file(f"{folder}/b*")

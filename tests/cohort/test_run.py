@@ -14,15 +14,15 @@ from nested_settings import changed
 from torchdeform.cohort.executors.local import Engine
 from torchdeform.cohort.executors.worker import EngineError, TimeLimit, WorkerLost
 from torchdeform.cohort.journal import Journal
-from torchdeform.cohort.plan import Job, Problem
+from torchdeform.cohort.plan import Failure, Job
 from torchdeform.cohort.run import Event, review, run
 from torchdeform.cohort.settings import EngineSettings
-from torchdeform.cohort.task import DONE, FAILED, Report, Task
+from torchdeform.cohort.task import DONE, FAILED, PairReport, Task
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.pipeline.register import PairFiles
 from torchdeform.registration.settings import RegistrationSettings
 
-Work = Callable[[Task], Report]
+Work = Callable[[Task], PairReport]
 
 
 class Feigned:
@@ -38,23 +38,23 @@ class Feigned:
         with ThreadPoolExecutor(1) as pool:
             yield Engine(lambda job: pool, 2, self.work)
 
-    def work(self, task: Task) -> Report:
+    def work(self, task: Task) -> PairReport:
         self.ran.append(task.job.name)
         return self.special.get(task.job.name, succeed)(task)
 
 
-def succeed(task: Task) -> Report:
+def succeed(task: Task) -> PairReport:
     task.job.files.out.mkdir(parents=True, exist_ok=True)
     (task.job.files.out / "warped.png").write_text(str(task.job.settings.window), encoding="ascii")
-    return Report(DONE, seconds=0.1, figures={"folds": 0}, files=("warped.png",))
+    return PairReport(DONE, seconds=0.1, figures={"folds": 0}, files=("warped.png",))
 
 
-def fail(task: Task) -> Report:
-    return Report(FAILED, "no good")
+def fail(task: Task) -> PairReport:
+    return PairReport(FAILED, "no good")
 
 
 def raising(error: BaseException) -> Work:
-    def work(task: Task) -> Report:
+    def work(task: Task) -> PairReport:
         raise error
 
     return work
@@ -151,7 +151,7 @@ def test_a_pair_that_fails_leaves_no_results_of_before(engine, jobs, out):
 
 
 def test_pairs_that_cannot_run_are_in_the_summary(engine, jobs, out):
-    summary = run(jobs, out, EngineSettings(), problems=[Problem("f", "there is no such file")])
+    summary = run(jobs, out, EngineSettings(), problems=[Failure("f", "there is no such file")])
     assert statuses(out)["f"] == "failed"
     assert (summary.done, summary.failed) == (5, 1)
 
@@ -181,7 +181,7 @@ def test_an_engine_that_does_not_run_stops_the_run(engine, jobs, out):
 def test_a_lost_cluster_stops_the_run(monkeypatch, jobs, out):
     class Lost(Executor):
         def submit(self, fn, /, *args, **kwargs):
-            future: Future[Report] = Future()
+            future: Future[PairReport] = Future()
             future.cancel()
             future.set_running_or_notify_cancel()
             return future
@@ -199,7 +199,7 @@ def test_a_lost_cluster_stops_the_run(monkeypatch, jobs, out):
 def test_events_tell_the_whole_story(engine, jobs, out):
     engine.special = {"c": fail}
     seen: list[Event] = []
-    run(jobs, out, EngineSettings(), problems=[Problem("f", "missing")], report=seen.append)
+    run(jobs, out, EngineSettings(), problems=[Failure("f", "missing")], report=seen.append)
     assert [event.kind for event in seen] == ["begin", "done", "done", "failed", "done", "done", "end"]
     assert (seen[-1].done, seen[-1].failed, seen[-1].total, seen[-1].skipped) == (4, 2, 6, 1)
     assert seen[0].left is None
@@ -237,7 +237,7 @@ def test_a_review_shows_all_pairs_whatever_ran_last(engine, jobs, out):
     run(jobs[:2], out, EngineSettings())
     run(jobs[3:4], out, EngineSettings())
     assert statuses(out) == {"d": "done"}
-    summary = review(jobs, out, [Problem("f", "missing")])
+    summary = review(jobs, out, [Failure("f", "missing")])
     assert (summary.done, summary.waiting, summary.failed) == (3, 2, 1)
     assert statuses(out) == {"a": "done", "b": "done", "c": "waiting", "d": "done", "e": "waiting", "f": "failed"}
 

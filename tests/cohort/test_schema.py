@@ -82,7 +82,7 @@ def test_resolved_file_says_the_same(cohort_of, tmp_path, monkeypatch):
         (_PATTERN + "    labels: '{x}.png'\n", 3, "labels: there is no part 'x'; the parts are subject"),
         (_PATTERN + "    parts: {subject: '('}\n", 6, "is no regular expression"),
         (_PATTERN + "    parts: {subjec: x}\n", 3, "parts: there is no part 'subjec'"),
-        (_PATTERN + "    fixed: t.png\n", 3, "fixed stands with pairing: template only, not with all"),
+        (_PATTERN + "    fixed: t.png\n", 3, "fixed is for pairing: template only, not for all"),
         (_PATTERN.replace("all", "template"), 3, "pairing: template needs fixed"),
         (_PATTERN.replace("all", "group"), 3, "pairing: group needs reference"),
         (_PATTERN.replace("all", "template") + "    fixed: t.png\n    labels: l.png\n", 3, "give both or neither"),

@@ -11,9 +11,9 @@ from torchdeform.cohort.settings import EngineSettings, expand
     [
         ({"kind": "dask"}, "either scheduler"),
         ({"kind": "dask", "scheduler": "tcp://a:1", "cluster": {"kind": "local"}}, "either scheduler"),
-        ({"scheduler": "tcp://a:1"}, "scheduler stands with kind: dask"),
-        ({"cluster": {"kind": "local"}}, "cluster stands with kind: dask"),
-        ({"kind": "dask", "scheduler": "tcp://a:1", "workers": 2}, "workers stands with kind: local"),
+        ({"scheduler": "tcp://a:1"}, "scheduler is for kind: dask"),
+        ({"cluster": {"kind": "local"}}, "cluster is for kind: dask"),
+        ({"kind": "dask", "scheduler": "tcp://a:1", "workers": 2}, "workers is for kind: local"),
         ({"kind": "dask", "cluster": {"kind": "slurm", "workers": 4, "cores": 2}}, "need as many cores"),
         ({"kind": "dask", "cluster": {"kind": "slurm", "workers": 4, "cores": 8, "gpus": 2}}, "takes a GPU"),
         ({"workers": 0}, "greater than or equal to 1"),

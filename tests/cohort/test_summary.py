@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from torchdeform.cohort.plan import Job, Problem
+from torchdeform.cohort.plan import Failure, Job
 from torchdeform.cohort.summary import COLUMNS, log_of, summarise
-from torchdeform.cohort.task import DONE, FAILED, Report
+from torchdeform.cohort.task import DONE, FAILED, PairReport
 from torchdeform.pipeline.register import PairFiles
 from torchdeform.registration.settings import RegistrationSettings
 
@@ -48,10 +48,10 @@ def outcome(tmp_path):
     log_of(tmp_path, "bad").parent.mkdir()
     log_of(tmp_path, "bad").touch()
     known = {
-        "good": Report(DONE, "", 2.25, 300_000_000, 0, {"folds": 0, "dice_after": 0.912345678}, ("overview.png",)),
-        "bad": Report(FAILED, NASTY, 0.5),
+        "good": PairReport(DONE, "", 2.25, 300_000_000, 0, {"folds": 0, "dice_after": 0.912345678}, ("overview.png",)),
+        "bad": PairReport(FAILED, NASTY, 0.5),
     }
-    return summarise(jobs, tmp_path, known, [Problem("never", f"no file {NASTY}")])
+    return summarise(jobs, tmp_path, known, [Failure("never", f"no file {NASTY}")])
 
 
 def table(path: Path) -> list[dict[str, str]]:
@@ -101,7 +101,7 @@ def test_links_lead_to_files(tmp_path, outcome):
 def test_a_pair_without_a_report_shows_its_overview(tmp_path, outcome):
     job = make_job(tmp_path, "good")
     (job.files.out / "report.html").unlink()
-    summarise([job], tmp_path, {"good": Report(DONE, files=("overview.png",))})
+    summarise([job], tmp_path, {"good": PairReport(DONE, files=("overview.png",))})
     assert Page((tmp_path / "index.html").read_text(encoding="utf-8")).links == ["sub%201/good/overview.png"]
 
 

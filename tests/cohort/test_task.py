@@ -7,14 +7,14 @@ from dataclasses import replace
 import pytest
 
 from torchdeform.cohort import task as module
-from torchdeform.cohort.task import DONE, FAILED, Report, Task, perform
+from torchdeform.cohort.task import DONE, FAILED, PairReport, Task, perform
 
 
 @pytest.fixture
-def do(monkeypatch, capfd) -> Callable[[Task], Report]:
+def do(monkeypatch, capfd) -> Callable[[Task], PairReport]:
     """`perform` as in a process of its own: streams end in the descriptors 1 and 2; crashes stay with the tests."""
 
-    def perform_here(task: Task) -> Report:
+    def perform_here(task: Task) -> PairReport:
         for descriptor, name in ((1, "stdout"), (2, "stderr")):
             stream = open(descriptor, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
             monkeypatch.setattr(sys, name, stream)

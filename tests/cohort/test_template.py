@@ -8,12 +8,12 @@ import pytest
 import torch
 from cohort_files import GRID, cohort, write_images
 
+from torchdeform import AveragingSettings, build_template
 from torchdeform.cohort.schema import read_cohort
 from torchdeform.cohort.settings import TemplateSettings
 from torchdeform.cohort.template import Built, build
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.io import read_image, read_labels, read_transform
-from torchdeform.registration.template import AveragingSettings, build_template
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_a_reference_that_cannot_be_read_ends_it_with_the_reason(tmp_path):
 
 def test_one_image_is_too_few(tmp_path):
     write_images(tmp_path / "images", 1)
-    with pytest.raises(InputError, match="needs 2 images at least, got 1"):
+    with pytest.raises(InputError, match="needs at least 2 images, got 1"):
         build(cohort(tmp_path))
 
 

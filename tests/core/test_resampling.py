@@ -16,17 +16,18 @@ from torchdeform.core.resampling import (
     MIN_NODES,
     Transfer,
     banded,
-    box_spread,
     box_sum,
+    box_sum_transpose,
     centres,
-    gathering,
+    coarsened,
+    hat_average,
     interpolation,
+    interpolation_transpose,
     multiply,
     prolong,
     pyramid_grids,
     restrict,
     restriction,
-    thinned,
 )
 
 LIKE = torch.zeros(0, dtype=torch.float64)
@@ -67,9 +68,23 @@ def test_interpolation_and_its_transpose(coarse, fine):
     up = applied(interpolation(coarse, fine, LIKE), field)
     torch.testing.assert_close(up, F.interpolate(field, fine, mode="linear", align_corners=True).flatten())
     force = torch.rand(fine, dtype=torch.float64)
-    down = applied(gathering(fine, coarse, LIKE), force)
+    down = applied(interpolation_transpose(fine, coarse, LIKE), force)
     torch.testing.assert_close((field.flatten() * down).sum(), (up * force).sum() * (coarse - 1) / (fine - 1))
     assert interpolation(coarse, coarse, LIKE) is None
+
+
+@pytest.mark.parametrize(("fine", "coarse"), [((15, 9), (8, 9)), ((12, 33, 20), (5, 11, 20)), ((40, 301), (7, 44))])
+def test_a_hat_average_is_weighted_by_the_hat_function_of_each_node(fine, coarse):
+    """Against dense matrices; the mean of what is constant is that constant."""
+    field = expected = torch.rand(2, 3, *fine, dtype=torch.float64)
+    for axis, (many, few) in enumerate(zip(fine, coarse, strict=True), start=2):
+        place = torch.linspace(0, few - 1, many, dtype=torch.float64)
+        hats = (1 - (place - torch.arange(few).unsqueeze(1)).abs()).clamp(min=0)
+        expected = torch.einsum("ij,j...->i...", hats / hats.sum(1, keepdim=True), expected.movedim(axis, 0))
+        expected = expected.movedim(0, axis)
+    torch.testing.assert_close(hat_average(field, Grid(coarse)), expected)
+    ones = torch.ones(1, 1, *fine)
+    torch.testing.assert_close(hat_average(ones, Grid(coarse)), torch.ones(1, 1, *coarse))
 
 
 @pytest.mark.parametrize(("fine", "coarse"), [(15, 8), (97, 30), (601, 151)])
@@ -115,7 +130,7 @@ def test_with_a_stride_windows_are_left_out_and_the_transpose_is_one(shape, wind
     few = box_sum(x, window, stride)
     torch.testing.assert_close(few, centres(box_sum(x, window), stride))
     y = torch.rand(few.shape, generator=generator, dtype=torch.float64)
-    torch.testing.assert_close((few * y).sum(), (x * box_spread(y, window, stride, tuple(shape))).sum())
+    torch.testing.assert_close((few * y).sum(), (x * box_sum_transpose(y, window, stride, tuple(shape))).sum())
 
 
 @settings(max_examples=50, deadline=None)
@@ -163,7 +178,7 @@ MODES = {2: "bilinear", 3: "trilinear"}
 @pytest.fixture(params=[(41, 36), (30, 20, 25), (12, 600)], ids=["2d", "3d", "long"])
 def transfer(request):
     fine = Grid(request.param, spacing=(1.0, 0.7, 1.3)[: len(request.param)])
-    return Transfer(fine, thinned(fine, 2.0), torch.zeros(1, dtype=torch.float64))
+    return Transfer(fine, coarsened(fine, 2.0), torch.zeros(1, dtype=torch.float64))
 
 
 def test_up_is_linear_interpolation(transfer):

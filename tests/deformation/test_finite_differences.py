@@ -8,8 +8,8 @@ from torch import Tensor
 
 from torchdeform.core.derivatives import CURL_PAIRS, cofactors, curl, divergence, jacobian_determinant, map_jacobian
 from torchdeform.core.grid import Grid
-from torchdeform.deformation.finite_differences import Differences, clear_boundary, dots
-from torchdeform.solvers.cg import conjugate_gradient
+from torchdeform.deformation.finite_differences import Differences, clear_boundary
+from torchdeform.solvers.cg import conjugate_gradient, dots
 
 UNTIMED = settings(deadline=None, max_examples=30)
 

@@ -16,7 +16,7 @@ from torchdeform.errors import InputError
 from torchdeform.io import write_image
 from torchdeform.metrics.mind import mind_ssc
 from torchdeform.metrics.similarity import MEASURES, features, make_similarity, needs_common_scale, similarity_weights
-from torchdeform.nn import SimilarityLoss
+from torchdeform.nn import DeformableRegistration, SimilarityLoss
 from torchdeform.pipeline.citations import citations
 from torchdeform.pipeline.config import load_settings
 from torchdeform.pipeline.memory import footprint
@@ -107,26 +107,27 @@ def test_unknown_names_and_bad_weights_are_explained(similarity, message):
 
 
 def test_settings_take_a_name_or_weights():
-    assert settings_of(similarity="mi").similarity == "mi"
+    assert settings_of(similarity="mi").similarity.measure == "mi"
     given = {"lncc": 1, "mi": 0.5}
     settings = settings_of(similarity=given)
     given["mi"] = 7
-    assert settings.similarity == {"lncc": 1, "mi": 0.5}
-    assert asdict(settings)["similarity"] == {"lncc": 1, "mi": 0.5}
+    assert settings.similarity.measure == {"lncc": 1, "mi": 0.5}
+    assert asdict(settings)["similarity"]["measure"] == {"lncc": 1, "mi": 0.5}
     assert pickle.loads(pickle.dumps(settings)) == settings
-    assert changed(settings, window=5).similarity == settings.similarity
+    assert changed(settings, window=5).similarity.measure == settings.similarity.measure
 
 
 def test_weights_come_from_files_and_overrides(tmp_path):
     file = tmp_path / "settings.yaml"
     file.write_text("similarity: {lncc: 1, mind: 5e-1}\n", encoding="utf-8")
-    assert load_settings(file=file).similarity == {"lncc": 1.0, "mind": 0.5}
-    assert load_settings(file=file, overrides={"similarity.mind": 2}).similarity == {"lncc": 1.0, "mind": 2.0}
-    assert load_settings(file=file, overrides={"similarity": "mi"}).similarity == "mi"
+    assert load_settings(file=file).similarity.measure == {"lncc": 1.0, "mind": 0.5}
+    double = load_settings(file=file, overrides={"similarity.measure.mind": 2})
+    assert double.similarity.measure == {"lncc": 1.0, "mind": 2.0}
+    assert load_settings(file=file, overrides={"similarity": "mi"}).similarity.measure == "mi"
 
 
 @pytest.mark.parametrize("similarity", [*MEASURES, {"lncc": 1, "mind": 2}])
-def test_a_registration_climbs_it(similarity):
+def test_a_registration_finds_a_known_map_by_it(similarity):
     """Waves bent by a known map are bent back, with another contrast for the measures that allow it."""
     grid = Grid((64, 60))
     x = grid.points(dtype=torch.float64)
@@ -154,8 +155,9 @@ def test_a_new_measure_is_a_new_row(monkeypatch, tmp_path):
     assert found.similarity_after > found.similarity_before
     assert needs_common_scale("new")
     assert AlignmentSettings(similarity="new").similarity == "new"
-    assert load_settings(overrides={"similarity": {"new": 2}}).similarity == {"new": 2.0}
+    assert load_settings(overrides={"similarity": {"new": 2}}).similarity.measure == {"new": 2.0}
     assert SimilarityLoss("new")(fixed, moving) == SimilarityLoss("ncc")(fixed, moving)
+    assert DeformableRegistration(Grid((64, 64)), steps=1, settings=settings)(fixed, moving).abs().max() > 0
     assert footprint(Grid((64, 64)), 1, settings) > footprint(Grid((64, 64)), 1, old)
     assert set(citations(settings)) - set(citations(old)) == {"new"}
     write_image(Image(fixed, Grid((64, 64))), path := tmp_path / "a.nrrd")

@@ -30,7 +30,12 @@ def test_default_preset_is_the_librarys_default():
 
 def test_default_preset_shows_every_setting():
     """The file is also the list of what can be set."""
-    assert set(read_yaml(configs_folder() / "presets" / "default.yaml")) == set(asdict(RegistrationSettings()))
+    shown = read_yaml(configs_folder() / "presets" / "default.yaml")
+    known = asdict(RegistrationSettings())
+    assert set(shown) == set(known)
+    for name, group in known.items():
+        if isinstance(group, dict):
+            assert set(shown[name]) == set(group)
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -39,9 +44,10 @@ def test_presets_load(name):
 
 
 def test_later_layers_win(tmp_path):
-    file = _file(tmp_path, "window: 7\nsteps: [5, 5]")
-    settings = load_settings("fast", file, {"steps": [3]})
-    assert (settings.window, settings.steps) == (7, (3,))
+    file = _file(tmp_path, "similarity: {window: 7}\noptimiser: {steps: [5, 5], momentum: 0.1}\nflow: rk4")
+    settings = load_settings("fast", file, {"optimiser.steps": [3], "flow.steps": 2})
+    assert (settings.similarity.window, settings.optimiser.steps, settings.optimiser.momentum) == (7, (3,), 0.1)
+    assert (settings.flow.method, settings.flow.steps) == ("rk4", 2)
 
 
 def test_empty_file_changes_nothing(tmp_path):
@@ -57,7 +63,7 @@ def test_overrides_are_yaml(text, value):
 
 
 def test_numbers_that_yaml_takes_for_text_are_numbers():
-    assert load_settings(overrides={"window": "7"}).window == 7
+    assert load_settings(overrides={"similarity.window": "7"}).similarity.window == 7
 
 
 @pytest.mark.parametrize("text", ["window", "=3", "window=[1"])
@@ -69,12 +75,17 @@ def test_malformed_overrides(text):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("windw: 5", r"settings.yaml: there is no setting 'windw'; did you mean 'window'\?"),
-        ("window: abc", r"settings.yaml: window = 'abc'"),
-        ("window: 5.5", r"settings.yaml: window = 5.5"),
-        ("window: 4", "window must be an odd number"),
+        ("similarity: {windw: 5}", r"yaml: there is no setting 'similarity.windw'; did you mean 'similarity.window'\?"),
+        ("windw: 5", r"settings.yaml: there is no setting 'windw'; did you mean 'similarity.window'\?"),
+        ("steps: [5]", r"settings.yaml: there is no setting 'steps'; did you mean 'optimiser.steps'\?"),
+        ("metric: 5", r"settings.yaml: metric is a group of settings \(weight_div, .*got 5"),
+        ("solver: {methd: cg}", r"settings.yaml: there is no setting 'solver.methd'; did you mean 'solver.method'\?"),
+        ("solver: gc", r"settings.yaml: solver must be one of auto.*did you mean 'cg'"),
+        ("similarity: {window: abc}", r"settings.yaml: similarity.window = 'abc'"),
+        ("similarity: {window: 5.5}", r"settings.yaml: similarity.window = 5.5"),
+        ("similarity: {window: 4}", "settings.yaml: similarity.window must be an odd number"),
         ("similarity: lnc", "similarity"),
-        ("steps: [10, a]", r"steps.1 = 'a'"),
+        ("optimiser: {steps: [10, a]}", r"optimiser.steps.1 = 'a'"),
         ("window: 5\nwindow: 7", r"settings.yaml is no valid YAML at line 2: window is given twice"),
         ("window: [5", r"settings.yaml is no valid YAML at line 1"),
         ("- window", "must hold 'key: value' lines"),
@@ -99,7 +110,7 @@ def test_unknown_names_get_the_nearest():
     with pytest.raises(InputError, match="did you mean 'fast'"):
         load_settings("fst")
     with pytest.raises(InputError, match=r"window = \{'size': 3\}"):
-        load_settings(overrides={"window.size": 3})
+        load_settings(overrides={"similarity.window.size": 3})
     with pytest.raises(InputError, match="did you mean 'similarity'"):
         load_settings(overrides={"similarty": "ssd"})
 

@@ -10,7 +10,7 @@ from pictures import bend, blobs
 from torchdeform.core.diagnostics import one_sided_determinant
 from torchdeform.core.flow import integrate
 from torchdeform.core.grid import Grid
-from torchdeform.core.resampling import thinned
+from torchdeform.core.resampling import coarsened
 from torchdeform.core.warp import warp
 from torchdeform.registration import optimise as levels
 from torchdeform.registration.deformable import register
@@ -22,7 +22,7 @@ def test_only_large_levels_carry_a_coarser_map(monkeypatch):
     grid = Grid((40, 48))
     assert levels._map_grid(grid, settings) == grid
     monkeypatch.setattr(levels, "_LARGE", math.prod(grid.shape) - 1)
-    assert levels._map_grid(grid, settings) == thinned(grid, 2.0)
+    assert levels._map_grid(grid, settings) == coarsened(grid, 2.0)
 
 
 @pytest.mark.parametrize("symmetric", [False, True])
@@ -66,7 +66,7 @@ def test_a_step_that_would_fold_is_shortened_and_others_are_not():
     grid = Grid((20, 24))
     v = torch.cat([bend(grid, 1.0), 40 * bend(grid, 1.0)])
     u = torch.zeros_like(v)
-    share, moved, lowest = levels.fold_free_step(level_of(grid), state_of(u, grid), v)
+    share, _, lowest = levels.fold_free_step(level_of(grid), state_of(u, grid), v)
     assert share[0] == 1 > share[1]
     assert (lowest.flatten(1).amin(1) >= 0.03).all()
     nan = levels.fold_free_step(level_of(grid), state_of(u, grid), v * torch.nan)

@@ -10,10 +10,9 @@ from pictures import bend, blobs, disc
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, resample
-from torchdeform.core.transform import Affine
+from torchdeform.core.transform import Affine, Transform
 from torchdeform.core.warp import compose, max_voxels, voxels, warp
 from torchdeform.errors import InputError
-from torchdeform.metrics.evaluation import carry_points
 from torchdeform.registration.deformable import register
 from torchdeform.registration.problem import Guidance, moved
 from torchdeform.registration.symmetric import common_axes, midspace_frame, root
@@ -33,8 +32,9 @@ def test_swapping_the_images_inverts_the_map(shape, similarity):
         distance = voxels(apart, grid)
         assert distance.mean() < (0.1 if similarity == "mind" else 0.05)  # MIND bends small volumes most
         assert distance.flatten().quantile(0.9) < 0.15
-    last = (result.levels[-1].similarity[-1] for result in (there, back))
-    torch.testing.assert_close(*last, rtol=1e-5, atol=1e-6)  # mirrored, to rounding
+    # Mirrored but for rounding: products of matrices do not give an item the same bits at each place of a batch.
+    torch.testing.assert_close(there.levels[0].similarity[1], back.levels[0].similarity[1], rtol=0, atol=1e-5)
+    torch.testing.assert_close(there.levels[-1].similarity[-1], back.levels[-1].similarity[-1], rtol=0, atol=1e-4)
 
 
 def test_swapping_images_that_have_nothing_in_common_inverts_the_map():
@@ -101,8 +101,8 @@ def test_swapping_images_on_different_grids_inverts_the_map():
     back = register(moving, fixed, SYMMETRIC, affine=affine.inverse())
     x, y = torch.meshgrid(torch.linspace(25, 60, 9), torch.linspace(26, 60, 9), indexing="ij")
     points = torch.stack([x.flatten(), y.flatten()]).unsqueeze(0).double()
-    ends = carry_points(points, fixed, affine, there.displacement)
-    returned = carry_points(ends, moving, affine.inverse(), back.displacement)
+    ends = Transform.from_displacement(there.displacement, fixed, affine=affine).points(points)
+    returned = Transform.from_displacement(back.displacement, moving, affine=affine.inverse()).points(ends)
     apart = (returned - points).norm(dim=1)
     assert (ends - affine(points)).norm(dim=1).mean() > 1
     assert apart.mean() < 0.05

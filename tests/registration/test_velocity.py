@@ -58,9 +58,9 @@ def test_every_solver_gives_the_same_direction(grid, method):
 def test_a_direction_has_no_unit_and_one_voxel(grid):
     force = field(grid, grid.dim)
     metric = VelocityMetric.of(grid, SETTINGS.metric, SETTINGS.solver, force)
-    v = metric.ascent(force)
+    v = normalise_step(metric.ascent(force), grid)
     torch.testing.assert_close(max_norm(v / grid.along(grid.spacing, v)), torch.ones(2, dtype=v.dtype))
-    torch.testing.assert_close(metric.ascent(1e-9 * force), v)
+    torch.testing.assert_close(metric.ascent(1e-9 * force), metric.ascent(force))
     assert not normalise_step(torch.zeros_like(v), grid).any()
     work = (v * metric.system.mass(force)).flatten(1).sum(1)  # it is a direction of ascent
     assert (work > 0).all()

@@ -49,5 +49,5 @@ def test_the_result_can_be_applied():
         assert words[1] in VERBS
         assert Path(words[2]).parent == Path("my results")
         options = [word for word in words if word.startswith("--")]
-        known = {f"--{name}" for name in VERBS[words[1]].__annotations__}
+        known = {f"--{name}" for name in VERBS[words[1]].run.__annotations__}
         assert set(options) <= known

@@ -1,16 +1,13 @@
 """``batch`` and ``schema``: many pairs from one file."""
 
 import json
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from torchdeform.cli.options import Quiet, table
-from torchdeform.cli.progress import CohortProgress
+from torchdeform.cli.progress import CohortProgress, stoppable
 from torchdeform.cohort.estimate import Costs, estimate
 from torchdeform.cohort.plan import DESCRIPTION, Plan, description, plan
 from torchdeform.cohort.run import review, run
@@ -21,23 +18,21 @@ from torchdeform.io.files import atomic_folder
 from torchdeform.pipeline.memory import readable
 from torchdeform.report.record import write_json
 
-STOPPED = 130  # exit code of a shell's command that Ctrl-C ended
-
 CohortFile = Annotated[Path, typer.Argument(metavar="COHORT.yaml", help="What to register, and how.")]
 DryRun = Annotated[
-    bool, typer.Option("--dry-run", metavar="", help="Show the pairs, what is missing, and what it takes; run nothing.")
+    bool, typer.Option("--dry-run", metavar="", help="Show the pairs, missing files, time and memory; run nothing.")
 ]
 PrintConfig = Annotated[
-    bool, typer.Option("--print-config", metavar="", help="Print the file with everything filled in; run nothing.")
+    bool, typer.Option("--print-config", metavar="", help="Print the file with all defaults; run nothing.")
 ]
 Only = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME", help="Only the pairs called so, or so and more (sub-01), or like sub-0*; repeatable."),
+    typer.Option(metavar="NAME", help="Only pairs with this name, or its start (sub-01), or like sub-0*; repeatable."),
 ]
 Resume = Annotated[
-    bool, typer.Option("--resume/--no-resume", help="Leave alone what is done with the same files and settings.")
+    bool, typer.Option("--resume/--no-resume", help="Skip pairs that are done with the same files and settings.")
 ]
-RetryFailed = Annotated[bool, typer.Option("--retry-failed", metavar="", help="Run again what failed before.")]
+RetryFailed = Annotated[bool, typer.Option("--retry-failed", metavar="", help="Also run pairs that failed before.")]
 SchemaOut = Annotated[
     Path | None, typer.Option("--out", metavar="FILE.json", show_default="standard output", help="Where to write it.")
 ]
@@ -54,8 +49,8 @@ def batch(
 ) -> None:
     """Register all pairs of a cohort: each MOVING is warped onto its FIXED, as register does it.
 
-    What is done stays done: the same command goes on where a run ended, and does again what has changed since.
-    The file is described in docs/cohorts.md; torchdeform schema helps editors to complete and check it.
+    Finished pairs are kept: the same command continues where a run ended, and repeats pairs that have changed.
+    docs/cohorts.md describes the file; with torchdeform schema an editor can complete and check it.
     """
     cohort = read_cohort(cohort_file)
     if print_config:
@@ -67,7 +62,7 @@ def batch(
         typer.echo(overview(work, estimate(work.jobs)))
         return
     how = {"resume": resume, "retry_failed": retry_failed}
-    with interrupted_by_termination(), CohortProgress(quiet) as progress:
+    with stoppable("batch"), CohortProgress(quiet) as progress:
         summary = _run(work, whole, cohort.engine, progress, how)
     if not quiet:
         typer.echo(outcome(summary))
@@ -76,35 +71,18 @@ def batch(
 
 
 def _run(work: Plan, whole: Plan, engine: EngineSettings, progress: CohortProgress, how: dict[str, bool]) -> Summary:
-    """Run a plan, a part of the whole cohort, and write the summary of the whole."""
+    """Run a plan, which may be a part of the cohort, and write the summary of the whole cohort."""
     try:
         summary = run(work.jobs, work.out, engine, problems=work.problems, report=progress.show, **how)
         write_json(description(), work.out / DESCRIPTION)
         return summary
-    except KeyboardInterrupt:
-        typer.echo("batch: stopped; what is done is kept, run the same command again to go on", err=True)
-        raise typer.Exit(STOPPED) from None
     finally:
-        if work is not whole:
+        if work is not whole:  # `run` wrote the summary of some pairs only
             review(whole.jobs, whole.out, whole.problems)
 
 
-@contextmanager
-def interrupted_by_termination() -> Iterator[None]:
-    """Let the signal by which queues end a job stop the run as Ctrl-C does."""
-
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    former = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, former)
-
-
 def outcome(summary: Summary) -> str:
-    """Return what became of a cohort, in a few lines."""
+    """Return the outcome of a cohort in a few lines."""
     lines = {"pairs": f"{summary.done} done, {summary.failed} failed"}
     if summary.failed:
         lines["failures"] = str(summary.out / FAILURES)
@@ -112,7 +90,7 @@ def outcome(summary: Summary) -> str:
 
 
 def schema(out: SchemaOut = None) -> None:
-    """Print the JSON Schema of a cohort file, with which editors complete and check it while one types."""
+    """Print the JSON Schema of a cohort file, with which editors complete and check it."""
     text = json.dumps(cohort_schema(), indent=2) + "\n"
     if out is None:
         typer.echo(text, nl=False)
@@ -122,7 +100,7 @@ def schema(out: SchemaOut = None) -> None:
 
 
 def overview(work: Plan, costs: Costs) -> str:
-    """Return the pairs of a plan, those that cannot run, and what it takes, as lines to read."""
+    """Return the pairs of a plan, those that cannot run, time and memory, as lines of text."""
     pairs = [f"{job.name}: {job.files.moving} -> {job.files.fixed}" for job in work.jobs]
     problems = [f"cannot run: {problem.name}: {problem.sentence}" for problem in work.problems]
     sums = {
@@ -132,5 +110,5 @@ def overview(work: Plan, costs: Costs) -> str:
         "results": str(work.out),
     }
     if costs.unknown:
-        sums["unknown"] = f"{costs.unknown} pairs whose size cannot be told before they run, not counted"
+        sums["unknown"] = f"{costs.unknown} pairs whose size is unknown before they run, not counted"
     return "\n".join([*pairs, *problems, table(sums)])

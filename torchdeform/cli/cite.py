@@ -22,7 +22,7 @@ ResultFile = Annotated[
 def cite(
     result: ResultFile = None, preset: Preset = "default", config: Config = None, assignments: Assignments = None
 ) -> None:
-    """Print BibTeX of what a registration uses: that of RESULT.json, or one with the settings given.
+    """Print BibTeX of the publications behind a registration: that of RESULT.json, or one with the given settings.
 
     A comment above each entry says what it is cited for.
     """
@@ -30,13 +30,13 @@ def cite(
     if result is None:
         typer.echo(bibtex(load_settings(preset, config, overrides)))
     elif preset != "default" or config is not None or overrides:
-        raise InputError(f"{result} holds its settings; leave --preset, --config and --set out")
+        raise InputError(f"{result} has settings of its own; leave out --preset, --config and --set")
     else:
         typer.echo(bibtex(recorded_settings(result)))
 
 
 def recorded_settings(path: Path) -> RegistrationSettings:
-    """Return the settings in a ``result.json``, those that this version knows.
+    """Return the settings in a ``result.json``, without those that this version does not know.
 
     Raises:
         InputError: the file cannot be read, or is no record of a registration.

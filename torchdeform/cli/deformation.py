@@ -1,4 +1,4 @@
-"""``grid``, ``reconstruct``, ``simulate``: the deformation method at the shell."""
+"""``grid``, ``reconstruct``, ``simulate``: the deformation method."""
 
 import os
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Annotated, Any, cast, get_args
 
 import typer
 
-from torchdeform.cli.options import Device, Json, Out, Quiet, among, print_json, table
+from torchdeform.cli.options import Device, Json, Out, Quiet, completion, print_json, table
 from torchdeform.deformation.velocity import VelocityName
 from torchdeform.errors import InputError
 from torchdeform.io.files import stem
@@ -25,8 +25,8 @@ Monitor = Annotated[
     str,
     typer.Option(
         metavar="NAME",
-        help=f"Where cells shall be small: {', '.join(get_args(MonitorName))} (IMAGE holds f itself).",
-        autocompletion=among(get_args(MonitorName)),
+        help=f"Where cells are small: {', '.join(get_args(MonitorName))} (IMAGE is f itself).",
+        autocompletion=completion(get_args(MonitorName)),
     ),
 ]
 FMin = Annotated[float, typer.Option("--f-min", metavar="F", help="Size of the smallest cells, relative to --f-max.")]
@@ -38,7 +38,7 @@ Smoothing = Annotated[
 Velocity = Annotated[
     str,
     typer.Option(
-        metavar="NAME", help=f"{', '.join(get_args(VelocityName))}.", autocompletion=among(get_args(VelocityName))
+        metavar="NAME", help=f"{', '.join(get_args(VelocityName))}.", autocompletion=completion(get_args(VelocityName))
     ),
 ]
 DisplacementFile = Annotated[
@@ -70,19 +70,16 @@ def adapt_grid(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Adapt a regular grid to IMAGE: cells become small where its monitor is, and none folds.
+    """Adapt a regular grid to IMAGE: cells become small where the monitor f is small, and none folds.
 
     Writes displacement.nii.gz (where each node goes), monitor.nii.gz, grid.png and result.json.
     """
+    # typer knows no Literal types, so `GridSettings` checks the names.
     settings = GridSettings(cast(MonitorName, monitor), f_min, f_max, smoothing, cast(VelocityName, velocity))
     folder = out or Path(f"{stem(image)}-grid")
     record = adapt_grid_to_file(image, folder, settings, choose_device(device))
-    _tell(
-        (json, quiet),
-        folder,
-        record,
-        {"determinant / monitor": f"off by {_number(record, 'determinant_error_mean'):.2g} on average"},
-    )
+    off = f"off by {_number(record, 'determinant_error_mean'):.2g} on average"
+    _print(folder, record, {"determinant / monitor": off}, json=json, quiet=quiet)
 
 
 def reconstruct(
@@ -102,7 +99,7 @@ def reconstruct(
     folder = out or Path(f"{stem(displacement)}-reconstructed")
     record = reconstruct_file(displacement, folder, order, refine, steps, choose_device(device))
     distance = f"{_number(record, 'distance_max'):.3g} at most, {_number(record, 'distance_mean'):.3g} on average"
-    _tell((json, quiet), folder, record, {"distance to the given map": distance})
+    _print(folder, record, {"distance to the given map": distance}, json=json, quiet=quiet)
 
 
 def simulate(
@@ -115,7 +112,7 @@ def simulate(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Let labelled regions of IMAGE grow or shrink by given factors, by a smooth map that does not fold.
+    """Grow or shrink labelled regions of IMAGE by given factors, with a smooth map that does not fold.
 
     Writes simulated.*, labels.*, displacement.nii.gz, transform.h5 (points after the change -> points of IMAGE, as a
     resampler needs it), inverse.h5 (points of IMAGE -> points after the change), grid.png and result.json.
@@ -124,13 +121,13 @@ def simulate(
     record = simulate_file(image, labels, _factors(volume), folder, rigid_mask, smoothing)
     volumes = cast("list[dict[str, Any]]", record["volumes"])
     reached = ", ".join(f"{v['label']}: {v['reached']:.4f} (asked {v['asked']:g})" for v in volumes)
-    _tell((json, quiet), folder, record, {"volumes": reached})
+    _print(folder, record, {"volumes": reached}, json=json, quiet=quiet)
 
 
 def _factors(texts: list[str]) -> dict[int, float]:
     pairs = [_factor(text) for text in texts]
     if len(dict(pairs)) < len(pairs):
-        raise InputError(f"--volume: a label is named twice in {', '.join(texts)}; give each once")
+        raise InputError(f"--volume: a label occurs twice in {', '.join(texts)}; give each once")
     return dict(pairs)
 
 
@@ -147,9 +144,8 @@ def _number(record: Record, name: str) -> float:
     return float(cast(float, record[name]))
 
 
-def _tell(how: tuple[bool, bool], folder: Path, record: Record, lines: dict[str, str]) -> None:
-    """Print what a program or a person wants to know of the result; ``how``: json, quiet."""
-    json, quiet = how
+def _print(folder: Path, record: Record, lines: dict[str, str], *, json: bool, quiet: bool) -> None:
+    """Print the record for a program, or a few lines for a person."""
     if json:
         print_json({**record, "out": str(folder)})
     if json or quiet:

@@ -1,5 +1,8 @@
-"""How far a cohort is: a bar where a person sees it, plain lines where they are kept."""
+"""Progress of a cohort: a bar on a terminal, plain lines elsewhere; and how a run is stopped."""
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import timedelta
 from typing import Self
 
@@ -11,22 +14,41 @@ from rich.progress import BarColumn, Progress, TextColumn
 from torchdeform.cohort.run import BEGIN, END, SKIPPED, Event
 from torchdeform.cohort.task import FAILED
 
+_STOPPED = 130  # exit code of a command that Ctrl-C ended, as shells have it
+
+
+@contextmanager
+def stoppable(verb: str) -> Iterator[None]:
+    """End the command in order when Ctrl-C or SIGTERM, by which queues end their jobs, stops the block."""
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    earlier = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo(f"{verb}: stopped; finished work is kept, run the same command again to continue", err=True)
+        raise typer.Exit(_STOPPED) from None
+    finally:
+        signal.signal(signal.SIGTERM, earlier)
+
 
 class CohortProgress:
     """Shows the events of a run on stderr, failures with their sentences.
 
     Args:
         quiet: show failures only.
-        title: what runs, at the head of the bar and of every line.
+        title: what runs; the bar and every line start with it.
     """
 
     def __init__(self, quiet: bool = False, title: str = "pairs") -> None:
         console = Console(stderr=True, highlight=False)
         columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[detail]}"))
-        self._seen = console.is_terminal and not quiet
+        self._on_terminal = console.is_terminal and not quiet
         self._quiet, self._title, self._skipped = quiet, title, 0
-        self._progress = Progress(*columns, console=console, transient=True, disable=not self._seen)
-        self._task = self._progress.add_task(title, total=None, detail="looking at what is done")
+        self._progress = Progress(*columns, console=console, transient=True, disable=not self._on_terminal)
+        self._task = self._progress.add_task(title, total=None, detail="looking for finished work")
 
     def __enter__(self) -> Self:
         self._progress.start()
@@ -48,10 +70,10 @@ class CohortProgress:
                 f"{self._title} {ended}/{event.total}: {event.name} {event.kind} in {event.seconds:.1f} s{_left(event)}"
             )
         elif event.kind == END and self._skipped:
-            self._say(f"{self._title}: {self._skipped} left as an earlier run settled them")
+            self._say(f"{self._title}: {self._skipped} already done (skipped)")
 
     def _say(self, line: str, *, always: bool = False) -> None:
-        if self._seen:
+        if self._on_terminal:
             if always:
                 self._progress.console.print(escape(line), soft_wrap=True)
         elif always or not self._quiet:
@@ -66,11 +88,11 @@ def _detail(event: Event) -> str:
 
 
 def _rate(per_second: float) -> str:
-    """Return pairs per the shortest time that makes them at least one."""
+    """Return pairs per second, minute, hour or day, whichever is the first with at least one."""
     for seconds, name in ((1, "s"), (60, "min"), (3600, "h")):
         if per_second * seconds >= 1:
-            return f"{per_second * seconds:.1f} a {name}"
-    return f"{per_second * 86400:.1f} a day"
+            return f"{per_second * seconds:.1f} per {name}"
+    return f"{per_second * 86400:.1f} per day"
 
 
 def _left(event: Event) -> str:

@@ -16,7 +16,7 @@ from torchdeform.cli.options import (
     Out,
     Quiet,
     Version,
-    among,
+    completion,
     print_json,
     table,
 )
@@ -52,17 +52,17 @@ Align = Annotated[
         metavar="KIND",
         show_default=False,
         help=f"First: {', '.join(ALIGNMENTS)} (usual).",
-        autocompletion=among(ALIGNMENTS),
+        autocompletion=completion(ALIGNMENTS),
     ),
 ]
 PointsWeight = Annotated[
-    float | None, typer.Option(metavar="W", show_default="0", help="Let the landmarks pull, with this weight.")
+    float | None, typer.Option(metavar="W", show_default="0", help="Weight of the landmarks against the similarity.")
 ]
 Symmetric = Annotated[
-    bool, typer.Option("--symmetric", metavar="", help="Prefer neither image: swapping them inverts the map.")
+    bool, typer.Option("--symmetric", metavar="", help="Treat both images alike: swapping them inverts the map.")
 ]
 Memory = Annotated[
-    str | None, typer.Option(metavar="SIZE", show_default="what is free", help="Take at most this, such as 4GB.")
+    str | None, typer.Option(metavar="SIZE", show_default="what is free", help="Use at most this, such as 4GB.")
 ]
 Preset = Annotated[
     str,
@@ -106,9 +106,10 @@ def register(
     """Warp MOVING onto FIXED: an alignment, then a map that does not fold.
 
     Writes report.html (open it: did it work?), warped.*, transform.h5, inverse.h5, displacement.nii.gz, overview.png
-    and result.json, all or none. transform.h5 takes points from FIXED to MOVING and brings the image MOVING onto FIXED;
-    inverse.h5 goes the other way.
+    and result.json, all or none. transform.h5 maps points from FIXED to MOVING and warps the image MOVING onto FIXED;
+    inverse.h5 does the opposite.
     """
+    # Options that were not given must not override the preset and the file.
     shortcuts = {"align": align, "points_weight": points_weight, "symmetric": symmetric or None}
     overrides = {key: value for key, value in shortcuts.items() if value is not None}
     settings = load_settings(preset, config, dict(map(parse_override, assignments or [])) | overrides)
@@ -129,13 +130,13 @@ def register(
     if json:
         print_json({**outcome.record, "out": str(outcome.folder)})
     elif not quiet:
-        for warning in outcome.record["warnings"]:
+        for warning in outcome.record["warnings"]:  # on stderr: standard output has the figures only
             typer.echo(f"warning: {warning}", err=True)
         typer.echo(summary(outcome))
 
 
 def summary(outcome: Outcome) -> str:
-    """Return what a person wants to know of a registration, in a few lines."""
+    """Return the most important figures of a registration in a few lines."""
     r, measure = outcome.record, " + ".join(similarity_weights(outcome.result.settings.similarity.measure))
     lines = {
         f"similarity ({measure})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
@@ -150,7 +151,7 @@ def summary(outcome: Outcome) -> str:
 
 
 def _measured(record: dict[str, Any]) -> dict[str, str]:
-    """Return lines about labels and landmarks, where they were given."""
+    """Return lines about labels and landmarks, if they were given."""
     lines = {}
     for key, name in (("dice_mean", "Dice"), ("landmark_error_mean", "landmark error")):
         stages = [
@@ -162,7 +163,7 @@ def _measured(record: dict[str, Any]) -> dict[str, str]:
 
 
 class _Bar:
-    """A progress bar on stderr, only where a person sees it."""
+    """A progress bar on stderr, on a terminal only."""
 
     def __init__(self, quiet: bool) -> None:
         console = Console(stderr=True)
@@ -184,7 +185,7 @@ class _Bar:
         self._progress.stop()
 
     def show(self, step: Step) -> None:
-        """Show one step of the optimisation; a level counts the same whatever its size."""
+        """Show one step of the optimisation. Every level is the same share of the bar."""
         done = (step.level + step.step / max(step.steps, 1)) / step.levels
         size = "×".join(map(str, step.shape))
         detail = f"step {step.step}, similarity {step.similarity.mean().item():.4g}"

@@ -7,9 +7,9 @@ from typing import Annotated, Any, Self
 
 import typer
 
-from torchdeform.cli.batch import STOPPED, RetryFailed, interrupted_by_termination
+from torchdeform.cli.batch import RetryFailed
 from torchdeform.cli.options import Quiet, table
-from torchdeform.cli.progress import CohortProgress
+from torchdeform.cli.progress import CohortProgress, stoppable
 from torchdeform.cohort.run import Event
 from torchdeform.cohort.schema import read_cohort
 from torchdeform.cohort.template import RECORD, Built, build
@@ -22,18 +22,14 @@ CohortFile = Annotated[
 
 
 def template(cohort_file: CohortFile, retry_failed: RetryFailed = False, quiet: Quiet = False) -> None:
-    """Make an unbiased template of the images of COHORT.yaml; run again, it goes on where it was stopped.
+    """Make an unbiased template of the images of COHORT.yaml. Run again, it continues where it was stopped.
 
     Writes template.nii.gz, overview.png, result.json and, for each image, subjects/NAME/ with warped.*, transform.h5
-    (takes points of the template to the image and brings the image onto the template) and inverse.h5 (the other way).
+    (maps points of the template to the image and warps the image onto the template) and inverse.h5 (the other way).
     """
     cohort = read_cohort(cohort_file)
-    try:
-        with interrupted_by_termination(), _Rounds(cohort.template.rounds, quiet) as rounds:
-            built = build(cohort, retry_failed=retry_failed, report=rounds.show)
-    except KeyboardInterrupt:
-        typer.echo("template: stopped; what is done is kept, run the same command again to go on", err=True)
-        raise typer.Exit(STOPPED) from None
+    with stoppable("template"), _Rounds(cohort.template.rounds, quiet) as rounds:
+        built = build(cohort, retry_failed=retry_failed, report=rounds.show)
     if not quiet:
         typer.echo(summary(built))
     if built.failures:
@@ -56,7 +52,7 @@ class _Rounds:
 
     def show(self, number: int, event: Event) -> None:
         """Show an event of a round."""
-        if number != self._number:
+        if number != self._number:  # the bar of the last round ends before the next one starts
             self._open.close()
             title = f"round {number} of {self._rounds},"
             self._number, self._progress = number, self._open.enter_context(CohortProgress(self._quiet, title))
@@ -64,7 +60,7 @@ class _Rounds:
 
 
 def summary(built: Built) -> str:
-    """Return what a person wants to know of a template, in a few lines."""
+    """Return the most important figures of a template in a few lines."""
     record: dict[str, Any] = dict(built.record)
     images = record["images"].values()
     low, high = min(i["determinant_min"] for i in images), max(i["determinant_max"] for i in images)

@@ -1,4 +1,4 @@
-"""``apply``, ``points``, ``invert``, ``compose``, ``jacobian``: transforms at the shell."""
+"""``apply``, ``points``, ``invert``, ``compose``, ``jacobian``: work with transforms."""
 
 import math
 from dataclasses import replace
@@ -9,13 +9,13 @@ from typing import Annotated
 import torch
 import typer
 
-from torchdeform.cli.options import Json, Quiet, among, print_json
+from torchdeform.cli.options import Json, Quiet, completion, print_json
 from torchdeform.core.image import Image
 from torchdeform.core.interpolation import COPYING, MODES
 from torchdeform.core.transform import Transform
 from torchdeform.errors import InputError, require_choice
 from torchdeform.io.files import require_writable, suffix
-from torchdeform.io.images import FORMATS, read_image, write_image
+from torchdeform.io.images import FORMATS, read_image, read_optional, write_image
 from torchdeform.io.labels import read_labels, write_labels
 from torchdeform.io.points import read_points, require_points_file, write_points
 from torchdeform.io.transforms import read_transform, require_transform_file, write_transform
@@ -28,9 +28,9 @@ TransformFile = Annotated[
 ]
 TransformFiles = Annotated[
     list[Path],
-    typer.Argument(metavar="FIRST SECOND ...", help="Transforms, the one that points go through first first."),
+    typer.Argument(metavar="FIRST SECOND ...", help="Transforms, in the order in which points go through them."),
 ]
-MovingFile = Annotated[Path, typer.Argument(metavar="MOVING", help="Image to bring over, any format, 2D or 3D.")]
+MovingFile = Annotated[Path, typer.Argument(metavar="MOVING", help="Image to warp, any format, 2D or 3D.")]
 PointsFile = Annotated[
     Path, typer.Argument(metavar="POINTS", help="Points: csv, tsv, elastix txt, Slicer fcsv or mrk.json.")
 ]
@@ -45,14 +45,14 @@ Reference = Annotated[
 ]
 Counted = Annotated[
     Path | None,
-    typer.Option(metavar="IMAGE", show_default=False, help="Image whose voxels POINTS counts, if it does."),
+    typer.Option(metavar="IMAGE", show_default=False, help="Image of the voxels, if POINTS counts in voxels."),
 ]
 FieldGrid = Annotated[
     Path | None,
     typer.Option(
         metavar="IMAGE",
         show_default="the grid in TRANSFORM",
-        help="Grid for the result, where it is a field (.nii.gz).",
+        help="Grid of the result, if that is a field (.nii.gz).",
     ),
 ]
 Interpolation = Annotated[
@@ -60,10 +60,10 @@ Interpolation = Annotated[
     typer.Option(
         metavar="NAME",
         help=f"{', '.join(MODES)}; label or nearest keep values and their type.",
-        autocompletion=among(MODES),
+        autocompletion=completion(MODES),
     ),
 ]
-Inverse = Annotated[bool, typer.Option("--inverse", metavar="", help="Go the other way, by the inverse of TRANSFORM.")]
+Inverse = Annotated[bool, typer.Option("--inverse", metavar="", help="Use the inverse of TRANSFORM.")]
 Outside = Annotated[float, typer.Option(metavar="VALUE", help="Value where MOVING does not reach.")]
 
 
@@ -76,13 +76,13 @@ def apply(
     inverse: Inverse = False,
     outside: Outside = 0.0,
 ) -> None:
-    """Bring the MOVING image onto the grid of the fixed image: result(x) = MOVING(TRANSFORM(x)).
+    """Warp the MOVING image onto the grid of the fixed image: result(x) = MOVING(TRANSFORM(x)).
 
-    Images go from moving to fixed with the same transform that takes points from fixed to moving. With --inverse an
+    Images go from moving to fixed with the same transform that maps points from fixed to moving. With --inverse an
     image of the fixed space goes to the moving space.
     """
     require_choice(interpolation, MODES, "--interpolation")
-    _prepare_image(out, transform, moving, reference)
+    _require_image_output(out, transform, moving, reference)
     labels = interpolation in COPYING
     chain = _read(transform, inverse)
     place = _place(chain, reference, transform)
@@ -98,29 +98,28 @@ def points(
     reference: Counted = None,
     inverse: Inverse = False,
 ) -> None:
-    """Take POINTS of the fixed image to the moving image: result = TRANSFORM(point), in world LPS mm.
+    """Map POINTS of the fixed image to the moving image: result = TRANSFORM(point), in world LPS mm.
 
     Points go from fixed to moving with the same transform that brings the moving image to the fixed one. With --inverse
     points of the moving image go to the fixed image.
     """
     require_points_file(out)
-    _prepare(out, transform, points, reference)
+    _require_output(out, transform, points, reference)
     chain = _read(transform, inverse)
-    image = None if reference is None else read_image(reference)
-    given = read_points(points, image, dim=chain.dim)
+    given = read_points(points, read_optional(reference), dim=chain.dim)
     write_points(replace(given, positions=chain.points(given.positions)), out)
 
 
 def invert(
     transform: TransformFile, out: OutFile, reference: FieldGrid = None, json: Json = False, quiet: Quiet = False
 ) -> None:
-    """Write the inverse of TRANSFORM, which takes points from moving to fixed and images from fixed to moving.
+    """Write the inverse of TRANSFORM, which maps points from moving to fixed and images from fixed to moving.
 
-    Affine maps are inverted exactly, displacement fields on their own grid. Prints how far a point comes to lie from
-    where it started after TRANSFORM and its inverse.
+    Affine maps are inverted exactly, displacement fields on their own grid. Prints how far a point is from its start
+    after TRANSFORM and its inverse.
     """
     require_transform_file(out)
-    _prepare(out, transform, reference)
+    _require_output(out, transform, reference)
     chain = _read(transform)
     inverse = _on_grid(chain.inverse(), reference)
     write_transform(inverse, out)
@@ -136,13 +135,15 @@ def invert(
 def compose(transforms: TransformFiles, out: OutFile, reference: FieldGrid = None) -> None:
     """Write one transform for several: points go through FIRST, then SECOND, and so on; images the other way.
 
-    The result takes points of the fixed space of FIRST to the moving space of the last, and brings images back. This
-    is the order in which ANTs lists its transforms.
+    The result maps points of the fixed space of FIRST to the moving space of the last, and images back. ANTs lists its
+    transforms in the same order.
     """
     require_transform_file(out)
-    _prepare(out, *transforms, reference)
+    _require_output(out, *transforms, reference)
     if len(transforms) < 2:
-        raise InputError("compose needs two transforms at least; name them, the one that points go through first first")
+        raise InputError(
+            "compose needs at least two transforms; give them in the order in which points go through them"
+        )
     write_transform(_on_grid(reduce(Transform.then, map(_read, transforms)), reference), out)
 
 
@@ -151,10 +152,10 @@ def jacobian(
 ) -> None:
     """Write the Jacobian determinant of TRANSFORM on the grid of the fixed image: moving volume over fixed volume.
 
-    Points go from fixed to moving: above 1 a piece of the fixed image is larger in the moving image, below 1 smaller,
+    Points go from fixed to moving: above 1 a piece of the fixed image is larger in the moving image, below 1 smaller;
     0 or less is a fold.
     """
-    _prepare_image(out, transform, reference)
+    _require_image_output(out, transform, reference)
     chain = _read(transform)
     image = chain.jacobian_determinant(_place(chain, reference, transform))
     write_image(image, out)
@@ -169,9 +170,6 @@ def jacobian(
         typer.echo(f"folds        {folds}")
 
 
-VERBS = {"apply": apply, "points": points, "invert": invert, "compose": compose, "jacobian": jacobian}
-
-
 def _read(path: Path, inverse: bool = False) -> Transform:
     chain = read_transform(path)
     return chain.inverse() if inverse else chain
@@ -179,22 +177,25 @@ def _read(path: Path, inverse: bool = False) -> Transform:
 
 def _place(chain: Transform, reference: Path | None, path: Path) -> Image | None:
     if reference is None and chain.reference is None:
-        raise InputError(f"{path} does not say which grid the result shall have; give --reference IMAGE")
-    return None if reference is None else read_image(reference)
+        raise InputError(f"{path} has no grid for the result; give --reference IMAGE")
+    return read_optional(reference)
 
 
 def _on_grid(chain: Transform, reference: Path | None) -> Transform:
     return chain if reference is None else replace(chain, fixed=read_image(reference))
 
 
-def _prepare_image(out: Path, *inputs: Path | None) -> None:
+def _require_image_output(out: Path, *inputs: Path | None) -> None:
     if suffix(out) not in FORMATS:
         raise InputError(f"{out} has no ending that images are written with; use one of {', '.join(FORMATS)}")
-    _prepare(out, *inputs)
+    _require_output(out, *inputs)
 
 
-def _prepare(out: Path, *inputs: Path | None) -> None:
-    """Raise `InputError` where the result cannot be written, or would replace what it is made from."""
+def _require_output(out: Path, *inputs: Path | None) -> None:
+    """Raise `InputError` if the result cannot be written, or would replace a file that it is made from.
+
+    Called before anything is read, so that a wrong name costs no time.
+    """
     for path in inputs:
         if path is not None and out.exists() and path.exists() and out.samefile(path):
             raise InputError(f"--out {out} is one of the files to read; choose another name")

@@ -47,8 +47,8 @@ class Costs:
 
 def estimate(jobs: Sequence[Job]) -> Costs:
     """Return what pairs take, to about a factor of two in time; every level is taken to use all its steps."""
-    look = cache(size_of)
-    seconds = [_seconds(job, look(job.files.fixed)) for job in jobs]
+    size = cache(size_of)
+    seconds = [_seconds(job, size(job.files.fixed)) for job in jobs]
     known = [value for value in seconds if value is not None]
     return Costs(sum(known), max(measure(jobs), default=0), len(seconds) - len(known))
 
@@ -63,9 +63,9 @@ def _seconds(job: Job, size: tuple[tuple[int, ...], int] | None) -> float | None
             grid = fitting_grid(grid, job.memory, channels, settings)
         except InputError:  # the pair itself will say so
             return None
-    wanted = settings.optimiser.steps
-    levels = pyramid_grids(grid, len(wanted))
-    steps = wanted[len(wanted) - len(levels) :]
+    steps = settings.optimiser.steps
+    levels = pyramid_grids(grid, len(steps))
+    steps = steps[len(steps) - len(levels) :]
     node_steps = sum(math.prod(g.shape) * steps_on(g, n, settings) for g, n in zip(levels, steps, strict=True))
     fields = (2 if symmetric else 1) * channels * sum(measure.time for measure in measures.values())
     return _PAIR + fields * _PER_NODE_STEP[grid.dim] * node_steps
@@ -77,8 +77,8 @@ def measure(jobs: Sequence[Job]) -> list[int]:
     Notes:
         Loads ITK, so it is called in a process that is not short of memory.
     """
-    look = cache(size_of)
-    return [_need(job, look(job.files.fixed)) for job in jobs]
+    size = cache(size_of)
+    return [_need(job, size(job.files.fixed)) for job in jobs]
 
 
 def size_of(path: Path) -> tuple[tuple[int, ...], int] | None:

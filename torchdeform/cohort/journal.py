@@ -1,4 +1,4 @@
-"""What is known of a cohort's pairs: a journal that a kill leaves readable, and prints of what they are made from."""
+"""The journal of a cohort: the outcome of every pair, readable even after a crash, and fingerprints of its files."""
 
 import hashlib
 import json
@@ -13,30 +13,30 @@ from typing import Any, Self
 
 from torchdeform import __version__
 from torchdeform.cohort.plan import Job
-from torchdeform.cohort.task import Report
+from torchdeform.cohort.task import PairReport
 from torchdeform.errors import InputError
 from torchdeform.io.dicom import is_dicom
 from torchdeform.io.files import stem
 
 JOURNAL = "journal.jsonl"
 
-_SETTLED = 2_000_000_000  # ns that a file must be old for its date to tell that it is the same
-_HEADERS = (".mhd", ".nhdr", ".hdr", ".img")  # whose pixels, or header, are in another file
+_SETTLED = 2_000_000_000  # ns; age from which on an unchanged date means unchanged content
+_HEADERS = (".mhd", ".nhdr", ".hdr", ".img")  # formats with header and pixels in two files
 _UNREADABLE = "unreadable"
 
 
 @dataclass(frozen=True)
 class Record:
-    """A pair's line of the journal: its name, the print of what it was made from, and what became of it."""
+    """A line of the journal about a pair: its name, the fingerprint of its inputs, and its outcome."""
 
     name: str
     key: str
-    report: Report
+    report: PairReport
 
 
 @dataclass(frozen=True)
 class Stamp:
-    """A file's size and date, and the hash of the content that it had with them."""
+    """Size and date of a file, and the hash that its content had then."""
 
     size: int
     mtime_ns: int
@@ -44,17 +44,16 @@ class Stamp:
 
 
 class Journal:
-    """The lines of ``journal.jsonl`` in a cohort's folder, the last one of a pair being the one that counts.
+    """The lines of ``journal.jsonl`` in a cohort's folder. The last line of a pair counts.
 
     Args:
-        folder: of the cohort's results; made if need be.
+        folder: of the cohort's results; created if missing.
 
     Raises:
-        InputError: the folder will not do, or another run is at work there.
+        InputError: the folder cannot be written, or another run is working there.
 
     Notes:
-        A line is written by one call and is on the disk when `record` returns. A line that was torn by a crash is
-        skipped, and a new one begins after it.
+        A line is on the disk when `record` returns. A line that a crash left incomplete is skipped.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -79,13 +78,13 @@ class Journal:
         os.close(self._file)
 
     def record(self, record: Record) -> None:
-        """Append what became of a pair; it is on the disk when this returns."""
+        """Append the outcome of a pair; it is on the disk when this returns."""
         self._append({"pair": record.name, "key": record.key, **asdict(record.report)})
         os.fsync(self._file)
         self.records[record.name] = record
 
     def fingerprint(self, job: Job) -> str:
-        """Return a hash of all that a pair's results depend on: the content of its files, settings and version."""
+        """Return a hash of everything that a pair's results depend on: content of its files, settings, version."""
         inputs = {
             f.name: (path.suffix, self._digest(path))
             for f in fields(job.files)
@@ -103,15 +102,15 @@ class Journal:
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
     def _digest(self, path: Path) -> str:
-        """Return the hash of an image's content; one that cannot be read has a hash of its own."""
+        """Return the hash of an image's content; images that cannot be read share one hash."""
         try:
-            digests = [self._digest_file(file) for file in _belonging(path)]
+            digests = [self._digest_file(file) for file in _files_of(path)]
         except OSError:
             return _UNREADABLE
         return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
     def _digest_file(self, path: Path) -> str:
-        """Return the hash of a file, without reading it if it has the size and date that it had before."""
+        """Return the hash of a file, without reading it if its size and date are unchanged."""
         status, name = path.stat(), str(path)
         known = self._stamps.get(name)
         if known is not None and (known.size, known.mtime_ns) == (status.st_size, status.st_mtime_ns):
@@ -125,11 +124,11 @@ class Journal:
 
     def _append(self, record: dict[str, Any]) -> None:
         line = memoryview(json.dumps(record).encode() + b"\n")
-        while line:  # a disk that is nearly full takes a part
+        while line:  # a disk that is nearly full writes a part
             line = line[os.write(self._file, line) :]
 
     def _lock(self, folder: Path) -> None:
-        """Keep other runs out until this process ends, however it ends."""
+        """Lock out other runs until this process ends, however it ends."""
         try:
             import fcntl
         except ImportError:  # no such locks on this system
@@ -138,7 +137,7 @@ class Journal:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             os.close(self._file)
-            raise InputError(f"another run is at work in {folder}; wait until it ends, or stop it") from error
+            raise InputError(f"another run is working in {folder}; wait until it ends, or stop it") from error
         except OSError:  # a file system without locks
             return
 
@@ -155,14 +154,14 @@ class Journal:
             record = json.loads(line)
             if "pair" in record:
                 name, key = record.pop("pair"), record.pop("key")
-                self.records[name] = Record(name, key, Report(**record | {"files": tuple(record["files"])}))
+                self.records[name] = Record(name, key, PairReport(**record | {"files": tuple(record["files"])}))
             else:
                 name = record.pop("file")
                 self._stamps[name] = Stamp(**record)
 
 
-def _belonging(path: Path) -> Iterator[Path]:
-    """Yield the files that an image consists of: those of a folder, a series, or a header and its pixels."""
+def _files_of(path: Path) -> Iterator[Path]:
+    """Yield all files of an image: those of a folder, of a series, or a header and its pixels."""
     if path.is_dir():
         yield from (p for p in sorted(path.rglob("*")) if p.is_file())
     elif path.suffix.lower() in _HEADERS:
@@ -174,7 +173,7 @@ def _belonging(path: Path) -> Iterator[Path]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make sure that the journal's name is on the disk too, where folders can be synchronised."""
+    """Write the folder's list of names to the disk, so that a crash cannot lose the journal's name."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

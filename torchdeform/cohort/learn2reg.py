@@ -1,4 +1,4 @@
-"""Learn2Reg: the pairs of a data set's JSON, and the name that a submission gives to a displacement field."""
+"""Learn2Reg: the pairs in the JSON of a data set, and the names of displacement fields in a submission."""
 
 import json
 import re
@@ -12,9 +12,9 @@ from torchdeform.errors import InputError
 
 _PAIRS = {"train": "training_paired_images", "val": "registration_val", "test": "registration_test"}
 _LISTS = ("training", "test")
-# What goes along with an image, by a pair's name for it: keys of the JSON, the first that is there.
-_BESIDE = {"labels": ("label",), "mask": ("mask",), "points": ("landmarks", "keypoints")}
-_BOTH = ("labels", "points")  # of use only if both images have them
+# Companions of an image by their name in a pair, with their keys in the JSON; the first that exists is used.
+_COMPANIONS = {"labels": ("label",), "mask": ("mask",), "points": ("landmarks", "keypoints")}
+_BOTH = ("labels", "points")  # useful only if both images have them
 _CASE = re.compile(r"_(\d{4})_(\d{4})\.nii\.gz$")
 
 
@@ -29,16 +29,16 @@ def learn2reg_pairs(source: Learn2Reg) -> list[PairSpec]:
     pairs = content.get(key)
     if not isinstance(pairs, list) or not pairs:
         raise InputError(f"{source.file} names no pairs for the split {source.split} ('{key}'); choose another split")
-    beside = {_normal(image["image"]): image for image in _images(content)}
-    return [_pair_spec(pair, beside, source.file, f"{key}[{n}]") for n, pair in enumerate(pairs)]
+    images = {_normal(image["image"]): image for image in _images(content)}
+    return [_pair_spec(pair, images, source.file, f"{key}[{n}]") for n, pair in enumerate(pairs)]
 
 
 def submission_name(fixed: Path, moving: Path) -> str:
-    """Return ``disp_0001_0002.nii.gz``, the name that the challenge's evaluation looks for.
+    """Return ``disp_0001_0002.nii.gz``, the name that the evaluation of the challenge expects.
 
     Args:
         fixed: image named ``..._CASE_MODALITY.nii.gz``, four digits each.
-        moving: as well. The modalities stand in the result unless both are the same, or 0000 and 0001.
+        moving: likewise. The name contains the modalities unless they are equal, or 0000 and 0001.
 
     Raises:
         InputError: another name.
@@ -68,7 +68,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _images(content: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return what the lists of images say of each that has more than a name."""
+    """Return the entries of the image lists that are more than a name."""
     listed = [image for key in _LISTS for image in content.get(key) or ()]
     return [image for image in listed if isinstance(image, dict) and isinstance(image.get("image"), str)]
 
@@ -77,13 +77,13 @@ def _normal(name: str) -> str:
     return Path(name).as_posix()
 
 
-def _pair_spec(pair: object, beside: Mapping[str, Mapping[str, Any]], file: Path, where: str) -> PairSpec:
+def _pair_spec(pair: object, images: Mapping[str, Mapping[str, Any]], file: Path, where: str) -> PairSpec:
     if not isinstance(pair, dict) or not all(isinstance(pair.get(side), str) for side in ("fixed", "moving")):
         raise InputError(f"{file}: {where} must name a fixed and a moving image")
     folder = file.absolute().parent
     files = {side: folder / pair[side] for side in ("fixed", "moving")}
     for side in ("fixed", "moving"):
-        for what, key in _beside(beside.get(_normal(pair[side]), {})):
+        for what, key in _companions(images.get(_normal(pair[side]), {})):
             files[f"{side}_{what}"] = folder / key
     for what in _BOTH:
         if len({f"fixed_{what}", f"moving_{what}"} & files.keys()) == 1:
@@ -92,7 +92,7 @@ def _pair_spec(pair: object, beside: Mapping[str, Mapping[str, Any]], file: Path
     return PairSpec(name=name, files=files, where=f"{file}: {where}", voxels=True)
 
 
-def _beside(image: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return what goes along with an image, and where it is."""
-    found = ((what, next((image[key] for key in keys if image.get(key)), None)) for what, keys in _BESIDE.items())
+def _companions(image: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the companions of an image and their paths."""
+    found = ((what, next((image[key] for key in keys if image.get(key)), None)) for what, keys in _COMPANIONS.items())
     return [(what, path) for what, path in found if isinstance(path, str)]

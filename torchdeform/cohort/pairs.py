@@ -1,4 +1,4 @@
-"""Pairs among the images that patterns find: to a template, one after another, every two, or to one of a group."""
+"""The pairs of a cohort: from a list, a table, a Learn2Reg data set, or among the images that patterns find."""
 
 import csv
 from collections import defaultdict
@@ -9,9 +9,9 @@ from pathlib import Path
 
 from torchdeform.cohort.learn2reg import learn2reg_pairs
 from torchdeform.cohort.names import PairSpec, entity, image_name, pair_name, shared_parts, subject_of
-from torchdeform.cohort.patterns import Found, fill, find, natural, only, search
+from torchdeform.cohort.patterns import FoundFile, fill_parts, find, natural_key, search, single_file
 from torchdeform.cohort.schema import COMPANIONS, Cohort, Images, Pair, PatternPairs, checked_name
-from torchdeform.cohort.settings import beside, expand
+from torchdeform.cohort.settings import absolute_path, expand
 from torchdeform.errors import InputError, nearest_name, require_choice
 from torchdeform.io.files import suffix
 from torchdeform.pipeline.config import parse_override
@@ -20,109 +20,108 @@ from torchdeform.pipeline.register import PairFiles
 _FILES = tuple(field.name for field in fields(PairFiles) if field.name != "out")
 
 
-def find_images(images: Images) -> list[Found]:
+def find_images(images: Images) -> list[FoundFile]:
     """Return the images that patterns or an expression find, sorted by their paths.
 
     Raises:
         InputError: there is none.
 
     Notes:
-        A file that is the regions, the mask or the landmarks of another is no image of its own, though the pattern may
-        match it.
+        A file with the labels, the mask or the landmarks of another one is no image, even if the pattern matches it.
     """
     if images.folder is not None and images.expression is not None:
         found = search(images.folder, images.expression)
     else:
         found = [one for pattern in images.files for one in find(pattern, images.parts)]
     unique = {one.path: one for one in found}
-    beside = {path for one in unique.values() for path in _beside(one, images)}
-    left = [one for path, one in unique.items() if path not in beside]
+    others = {path for one in unique.values() for path in _existing_companions(one, images)}
+    left = [one for path, one in unique.items() if path not in others]
     if not left:
-        looked = images.expression or ", ".join(images.files)
-        raise InputError(f"no file matches {looked}; check the pattern and the folder")
+        shown = images.expression or ", ".join(images.files)
+        raise InputError(f"no file matches {shown}; check the pattern and the folder")
     return left
 
 
 def pattern_pairs(pattern: PatternPairs, where: str) -> list[PairSpec]:
-    """Return the pairs of a pattern; a pair whose regions, mask or landmarks cannot be told keeps the reason."""
+    """Return the pairs of a pattern. A pair without a unique mask, labels or landmarks gets a problem."""
     images = find_images(pattern)
     if pattern.pairing == "template":
         return [_to_template(one, pattern, where) for one in images if one.path != _template(one, pattern)]
-    groups: dict[tuple[str, ...], list[Found]] = defaultdict(list)
+    groups: dict[tuple[str, ...], list[FoundFile]] = defaultdict(list)
     for one in images:
         groups[tuple(one.parts[name] for name in pattern.within)].append(one)
     if pattern.order is not None:
         for group in groups.values():
-            group.sort(key=lambda one: natural(one.parts[str(pattern.order)]))
+            group.sort(key=lambda one: natural_key(one.parts[str(pattern.order)]))
     return [pair for group in groups.values() for pair in _PAIRINGS[pattern.pairing](group, pattern, where)]
 
 
-def companions(one: Found, images: Images, side: str) -> dict[str, Path]:
-    """Return what goes along with an image, called as a pair calls it.
+def companions(one: FoundFile, images: Images, side: str) -> dict[str, Path]:
+    """Return the labels, mask and landmarks of an image, by their names in a pair.
 
     Raises:
         InputError: several files match a pattern, or none.
     """
     patterns = images.companions().items()
-    return {f"{side}_{COMPANIONS[key]}": only(fill(pattern, one.parts)) for key, pattern in patterns}
+    return {f"{side}_{COMPANIONS[key]}": single_file(fill_parts(pattern, one.parts)) for key, pattern in patterns}
 
 
-def _beside(one: Found, images: Images) -> list[Path]:
+def _existing_companions(one: FoundFile, images: Images) -> list[Path]:
     try:
         return list(companions(one, images, "").values())
     except InputError:
         return []
 
 
-def _template(moving: Found, pattern: PatternPairs) -> Path | None:
+def _template(moving: FoundFile, pattern: PatternPairs) -> Path | None:
     try:
-        return only(fill(pattern.fixed or "", moving.parts))
+        return single_file(fill_parts(pattern.fixed or "", moving.parts))
     except InputError:
         return None
 
 
-def _to_template(moving: Found, pattern: PatternPairs, where: str) -> PairSpec:
+def _to_template(moving: FoundFile, pattern: PatternPairs, where: str) -> PairSpec:
     def files() -> dict[str, Path]:
-        fixed = {key: only(fill(text, moving.parts)) for key, text in pattern.fixed_files().items()}
+        fixed = {key: single_file(fill_parts(text, moving.parts)) for key, text in pattern.fixed_files().items()}
         return {**fixed, "moving": moving.path, **companions(moving, pattern, "moving")}
 
     return _pair_spec(image_name(moving.path, moving.parts), files, where, subject_of(moving.parts))
 
 
-def _consecutive(group: list[Found], pattern: PatternPairs, where: str) -> Iterator[PairSpec]:
+def _consecutive(group: list[FoundFile], pattern: PatternPairs, where: str) -> Iterator[PairSpec]:
     for fixed, moving in pairwise(group):
         yield _between(fixed, moving, pattern, where)
 
 
-def _all(group: list[Found], pattern: PatternPairs, where: str) -> Iterator[PairSpec]:
+def _all(group: list[FoundFile], pattern: PatternPairs, where: str) -> Iterator[PairSpec]:
     for fixed, moving in (permutations if pattern.both_ways else combinations)(group, 2):
         yield _between(fixed, moving, pattern, where)
 
 
-def _to_member(group: list[Found], pattern: PatternPairs, where: str) -> Iterator[PairSpec]:
+def _to_member(group: list[FoundFile], pattern: PatternPairs, where: str) -> Iterator[PairSpec]:
     chosen = [one for one in group if pattern.reference.items() <= one.parts.items()]
     if len(chosen) == 1:
         for moving in group:
             if moving is not chosen[0]:
                 yield _between(chosen[0], moving, pattern, where)
         return
-    wanted = ", ".join(f"{key} {value}" for key, value in pattern.reference.items())
+    reference = ", ".join(f"{key} {value}" for key, value in pattern.reference.items())
     parts = {key: group[0].parts[key] for key in pattern.within}
     name = "_".join(entity(*part) for part in parts.items()) or "group"
-    problem = f"{len(chosen)} of its {len(group)} images have {wanted}, and one must; check reference and the files"
+    problem = f"{len(chosen)} of its {len(group)} images have {reference}, not one; check reference and the files"
     yield PairSpec(name=name, files={}, where=where, subject=subject_of(parts), problem=problem)
 
 
 _PAIRINGS = {"consecutive": _consecutive, "all": _all, "group": _to_member}
 
 
-def _between(fixed: Found, moving: Found, pattern: PatternPairs, where: str) -> PairSpec:
-    """Return the pair of two images that were found."""
+def _between(fixed: FoundFile, moving: FoundFile, pattern: PatternPairs, where: str) -> PairSpec:
+    """Return the pair of two found images."""
 
     def files() -> dict[str, Path]:
         sides = (("fixed", fixed), ("moving", moving))
-        beside = [companions(one, pattern, side).items() for side, one in sides]
-        return {"fixed": fixed.path, "moving": moving.path, **dict(beside[0]), **dict(beside[1])}
+        found = {key: path for side, one in sides for key, path in companions(one, pattern, side).items()}
+        return {"fixed": fixed.path, "moving": moving.path, **found}
 
     name = pair_name(fixed.path, moving.path, fixed.parts, moving.parts)
     return _pair_spec(name, files, where, subject_of(shared_parts(fixed.parts, moving.parts)))
@@ -136,10 +135,10 @@ def _pair_spec(name: str, files: Callable[[], dict[str, Path]], where: str, subj
 
 
 def pair_specs(cohort: Cohort) -> list[PairSpec]:
-    """Return the pairs of a cohort as it names them; nothing is looked at but names.
+    """Return the pairs of a cohort; only the names of files are read.
 
     Raises:
-        InputError: the cohort has no pairs, or what says them is wrong.
+        InputError: the cohort has no pairs, or the part that lists them is wrong.
     """
     pairs = cohort.pairs
     if pairs is None:
@@ -153,15 +152,15 @@ def pair_specs(cohort: Cohort) -> list[PairSpec]:
     else:
         found = [_listed(pair, f"{cohort.path}: pairs.list[{n}]") for n, pair in enumerate(pairs.list or ())]
     if not found:
-        raise InputError(f"{cohort.path} comes to no pair at all; check pairs")
+        raise InputError(f"{cohort.path} gives no pair at all; check pairs")
     return found
 
 
 def named_images(cohort: Cohort) -> dict[str, dict[str, Path]]:
-    """Return the images of a template by their names: ``image``, and ``labels``, ``mask`` and ``points`` where given.
+    """Return the images of a template by name: ``image``, and ``labels``, ``mask`` and ``points`` if given.
 
     Raises:
-        InputError: the cohort has no images, none is found, two would have one name, or what goes along is missing.
+        InputError: the cohort has no images, none is found, two get the same name, or a companion is missing.
     """
     if cohort.images is None:
         raise InputError(f"{cohort.path} names no images; add images with files, the pattern of their paths")
@@ -170,9 +169,9 @@ def named_images(cohort: Cohort) -> dict[str, dict[str, Path]]:
         name = image_name(one.path, one.parts)
         if name in named:
             paths = f"{named[name]['image']} and {one.path}"
-            raise InputError(f"{paths} would both be called {name}; name the part that differs, as {{subject}}")
-        beside = {key.lstrip("_"): path for key, path in companions(one, cohort.images, "").items()}
-        named[name] = {"image": one.path, **beside}
+            raise InputError(f"{paths} would both be called {name}; name the part that differs, such as {{subject}}")
+        others = {key.lstrip("_"): path for key, path in companions(one, cohort.images, "").items()}
+        named[name] = {"image": one.path, **others}
     return named
 
 
@@ -189,11 +188,10 @@ _EMPTY = ("", "n/a")  # BIDS writes n/a where there is nothing
 
 
 def table_pairs(path: Path) -> list[PairSpec]:
-    """Return the pairs of a table; its paths are relative to its own folder.
+    """Return the pairs of a table. Its paths are relative to its folder.
 
     Raises:
-        InputError: the file is missing, no table, lacks a column or has one that means nothing, or a row that is wrong;
-            with the line.
+        InputError: the file is missing or no table, lacks a column, has an unknown one or a wrong row; with the line.
     """
     require_choice(suffix(path), _SEPARATORS, f"{path}: the ending of a table")
     try:
@@ -215,15 +213,15 @@ def _require_columns(titles: list[str], path: Path) -> None:
             hint = nearest_name(title, _COLUMNS) or f"; there are {', '.join(_COLUMNS)} and {_SETTING}KEY"
             raise InputError(f"{path} line 1: there is no column '{title}'{hint}")
         if titles.count(title) > 1:
-            raise InputError(f"{path} line 1: the column '{title}' stands there twice")
+            raise InputError(f"{path} line 1: the column '{title}' occurs twice; remove one")
     for title in ("fixed", "moving"):
         if title not in titles:
-            raise InputError(f"{path} line 1: the column '{title}' is missing")
+            raise InputError(f"{path} line 1: the column '{title}' is missing; add it")
 
 
 def _cells(row: list[str], titles: list[str], where: str) -> list[str]:
     if len(row) != len(titles):
-        raise InputError(f"{where}: it has {len(row)} cells and the first line {len(titles)}")
+        raise InputError(f"{where}: it has {len(row)} cells but the first line {len(titles)}; complete it")
     return [cell.strip() for cell in row]
 
 
@@ -231,9 +229,9 @@ def _row_pair(row: Mapping[str, str], folder: Path, where: str) -> PairSpec:
     given = {title: cell for title, cell in row.items() if cell not in _EMPTY}
     for title in ("fixed", "moving"):
         if title not in given:
-            raise InputError(f"{where}: {title} is empty")
+            raise InputError(f"{where}: {title} is empty; give a file")
     try:
-        files = {key: beside(folder.resolve(), expand(given[key])) for key in _FILES if key in given}
+        files = {key: absolute_path(folder.resolve(), expand(given[key])) for key in _FILES if key in given}
         name = checked_name(given["name"]) if "name" in given else pair_name(files["fixed"], files["moving"], {}, {})
         settings = (
             parse_override(f"{k.removeprefix(_SETTING)}={v}") for k, v in given.items() if k.startswith(_SETTING)

@@ -1,4 +1,4 @@
-"""Patterns of paths with named parts, ``sub-{subject}/ses-{session}/*_T1w.nii.gz``: finding files, and filling in."""
+"""Patterns of paths with named parts, ``sub-{subject}/ses-{session}/*_T1w.nii.gz``: find files, fill in parts."""
 
 import glob
 import re
@@ -14,15 +14,15 @@ _ANYTHING = "[^/]+?"
 
 
 @dataclass(frozen=True)
-class Found:
-    """A file that a pattern matches, and the parts of its path that the pattern names."""
+class FoundFile:
+    """A file that matches a pattern, and the named parts of its path."""
 
     path: Path
     parts: Mapping[str, str]
 
 
 def literal(text: str) -> str:
-    """Return the pattern that matches this text only."""
+    """Return the pattern that matches only this text."""
     return "".join(f"[{character}]" if character in _SPECIAL else character for character in text)
 
 
@@ -30,7 +30,7 @@ def part_names(pattern: str) -> tuple[str, ...]:
     """Return the names of the parts of a pattern, in their order.
 
     Raises:
-        InputError: a brace that belongs to no name.
+        InputError: a brace without a name.
     """
     rest = _TOKENS.sub("", pattern)
     if "{" in rest or "}" in rest:
@@ -38,36 +38,36 @@ def part_names(pattern: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(token["part"] for token in _TOKENS.finditer(pattern) if token["part"]))
 
 
-def find(pattern: str, parts: Mapping[str, str]) -> list[Found]:
-    """Return the files that match a pattern, sorted by their paths, numbers in them by their size.
+def find(pattern: str, parts: Mapping[str, str]) -> list[FoundFile]:
+    """Return the files that match a pattern, sorted by their paths; numbers in paths are sorted by value.
 
     Args:
-        pattern: absolute path with ``*``, ``?``, ``[abc]``, ``**/`` for any folders, and ``{part}``; a part that stands
-            there twice is the same in both places.
-        parts: what a part may be, as a regular expression by its name; anything but / where none is given.
+        pattern: absolute path with ``*``, ``?``, ``[abc]``, ``**/`` for any folders, and ``{part}``. A part that occurs
+            twice must be the same in both places.
+        parts: regular expressions that parts must match, by name; anything but / if none is given.
     """
     expression = _compiled(_translated(pattern, parts), pattern)
     found = ((Path(path), expression.fullmatch(Path(path).as_posix())) for path in _matching(pattern))
-    return _sorted([Found(path, match.groupdict()) for path, match in found if match])
+    return _sorted([FoundFile(path, match.groupdict()) for path, match in found if match])
 
 
-def search(folder: Path, expression: str) -> list[Found]:
-    """Return the files below a folder whose path there is matched, whole, by a regular expression with named groups."""
+def search(folder: Path, expression: str) -> list[FoundFile]:
+    """Return the files below a folder whose whole path there matches a regular expression with named groups."""
     compiled = _compiled(expression, expression)
     files = (path for path in folder.rglob("*") if not path.is_dir())
     found = ((path, compiled.fullmatch(path.relative_to(folder).as_posix())) for path in files)
-    return _sorted([Found(path, match.groupdict("")) for path, match in found if match])
+    return _sorted([FoundFile(path, match.groupdict("")) for path, match in found if match])
 
 
-def fill(pattern: str, parts: Mapping[str, str]) -> str:
+def fill_parts(pattern: str, parts: Mapping[str, str]) -> str:
     """Return a pattern with its parts filled in."""
     return _TOKENS.sub(lambda token: literal(parts[token["part"]]) if token["part"] else token[0], pattern)
 
 
-def only(pattern: str) -> Path:
+def single_file(pattern: str) -> Path:
     """Return the one file that a pattern without parts matches.
 
-    A pattern that matches one path only is that path, whether it exists or not.
+    A pattern without wildcards is a path, whether it exists or not.
 
     Raises:
         InputError: several files match, or none.
@@ -79,40 +79,40 @@ def only(pattern: str) -> Path:
     if len(paths) == 1:
         return Path(paths[0])
     seen = f"{len(paths)} files match: {paths[0]}, {paths[1]} ..." if paths else "no file matches"
-    raise InputError(f"{plain} must match one file, and {seen}")
+    raise InputError(f"{plain} must match one file, but {seen}; correct the pattern")
 
 
 def require_parts(names: Mapping[str, object] | tuple[str, ...], known: tuple[str, ...], where: str) -> None:
     """Raise `InputError` unless every name is one of the known parts."""
     for name in names:
         if name not in known:
-            have = f"the parts are {', '.join(known)}" if known else "no part is named, as {subject} would"
-            raise InputError(f"{where}: there is no part '{name}'{nearest_name(name, known) or f'; {have}'}")
+            hint = f"the parts are {', '.join(known)}" if known else "the pattern names no part, such as {subject}"
+            raise InputError(f"{where}: there is no part '{name}'{nearest_name(name, known) or f'; {hint}'}")
 
 
-def natural(text: str) -> list[tuple[bool, int, str]]:
-    """Return a key by which ``ses-2`` comes before ``ses-10``."""
+def natural_key(text: str) -> list[tuple[bool, int, str]]:
+    """Return a key for sorting that puts ``ses-2`` before ``ses-10``."""
     pieces = re.findall(r"[0-9]+|[^0-9]+", text)
     return [(not piece.isdecimal(), int(piece) if piece.isdecimal() else 0, piece) for piece in pieces]
 
 
 def _matching(pattern: str) -> list[str]:
-    """Return the paths that a pattern may mean, files that are hidden left out."""
-    return glob.glob(_TOKENS.sub(_to_glob, pattern), recursive=True)  # noqa: PTH207 - pathlib takes hidden files too
+    """Return the paths that may match a pattern, without hidden files."""
+    return glob.glob(_TOKENS.sub(_to_glob, pattern), recursive=True)  # noqa: PTH207 - pathlib would find hidden files, too
 
 
-def _sorted(found: list[Found]) -> list[Found]:
-    return sorted(found, key=lambda one: natural(one.path.as_posix()))
+def _sorted(found: list[FoundFile]) -> list[FoundFile]:
+    return sorted(found, key=lambda one: natural_key(one.path.as_posix()))
 
 
 def _plain(pattern: str) -> str:
-    """Return a pattern as a person would read it."""
+    """Return a pattern without its brackets around special characters."""
     return re.sub(r"\[([*?[{}])\]", r"\1", pattern)
 
 
 def _to_glob(token: re.Match[str]) -> str:
     if token["any"]:
-        return "*"  # two of them within a name are one
+        return "*"  # two in a row are one
     return token[0] if not token["part"] else "*"
 
 
@@ -142,4 +142,4 @@ def _compiled(expression: str, shown: str) -> re.Pattern[str]:
     try:
         return re.compile(expression)
     except re.error as error:
-        raise InputError(f"{shown!r} makes no regular expression: {error}; check parts") from error
+        raise InputError(f"{shown!r} is no regular expression with these parts: {error}; check parts") from error

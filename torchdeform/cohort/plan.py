@@ -1,4 +1,4 @@
-"""What a cohort comes to: its pairs as jobs, those that cannot run, and what all of it will take."""
+"""The plan of a cohort: its pairs as jobs, and the pairs that cannot run."""
 
 import json
 import os
@@ -28,11 +28,11 @@ class Job:
     Args:
         name: of the pair, unique in its cohort, of letters, digits, ``.``, ``_`` and ``-`` only.
         files: all paths absolute; ``files.out`` is the pair's own folder inside the cohort's.
-        settings: resolved, the pair's own included.
+        settings: of the pair, complete.
         device: ``auto``, ``cpu`` or ``cuda``.
-        memory: bytes to take at most, None for what is free.
+        memory: limit in bytes, None for all that is free.
         submission: file for the displacement as the Learn2Reg challenge reads it, None for none.
-        voxels: landmarks are rows of voxel indices without titles, as Learn2Reg has them.
+        voxels: whether landmarks are rows of voxel indices without titles, as in Learn2Reg.
     """
 
     name: str
@@ -44,13 +44,9 @@ class Job:
     voxels: bool = False
 
 
-SUBMISSION = "submission"
+SUBMISSION, DESCRIPTION = "submission", "dataset_description.json"
 
-
-DESCRIPTION = "dataset_description.json"
-
-
-# What stands in a cohort's folder beside the pairs, so no pair may be called so.
+# Other names in a cohort's folder, which no pair may have.
 _RESERVED = (
     "logs",
     SUBMISSION,
@@ -62,41 +58,44 @@ _RESERVED = (
     DESCRIPTION,
 )
 
+_POINTS = ("fixed_points", "moving_points")
+
 
 @dataclass(frozen=True)
-class Problem:
-    """A pair that cannot run: its name, and a sentence that says why."""
+class Failure:
+    """A pair that failed or cannot run: its name, a sentence that says why, and its log, None if it never ran."""
 
     name: str
     sentence: str
+    log: Path | None = None
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a cohort comes to.
+    """The pairs of a cohort.
 
     Attributes:
         out: folder of the cohort's results.
         jobs: pairs that can run, in the order of the cohort.
-        problems: pairs that cannot.
+        problems: pairs that cannot run.
     """
 
     out: Path
     jobs: tuple[Job, ...]
-    problems: tuple[Problem, ...] = ()
+    problems: tuple[Failure, ...] = ()
 
-    def only(self, wanted: Iterable[str]) -> "Plan":
-        """Return the plan of the pairs that are called so, begin so (``sub-01``), or match a pattern (``sub-0*``).
+    def only(self, names: Iterable[str]) -> "Plan":
+        """Return the plan of the pairs with these names, starts of names (``sub-01``) or patterns (``sub-0*``).
 
         Raises:
             InputError: a name that no pair has.
         """
-        names = [one.name for one in (*self.jobs, *self.problems)]
+        known = [one.name for one in (*self.jobs, *self.problems)]
         kept: set[str] = set()
-        for name in wanted:
-            found = select(names, name)
+        for name in names:
+            found = select(known, name)
             if not found:
-                raise InputError(f"--only: no pair is called {name!r}{nearest_name(name, names)}; see --dry-run")
+                raise InputError(f"--only: no pair is called {name!r}{nearest_name(name, known)}; see --dry-run")
             kept.update(found)
         jobs, problems = ([one for one in some if one.name in kept] for some in (self.jobs, self.problems))
         return replace(self, jobs=tuple(jobs), problems=tuple(problems))
@@ -106,31 +105,31 @@ def plan(cohort: Cohort) -> Plan:
     """Return the jobs of a cohort, and the pairs that cannot run.
 
     Raises:
-        InputError: no pair at all, two pairs that would write the same place, a name that the folder needs for
-            something else, or settings that are wrong.
+        InputError: no pair at all, two pairs with the same folder, a name that the folder needs for something else, or
+            wrong settings.
 
     Notes:
-        Of the files only their existence is looked at.
+        Files are not read; only their existence is checked.
     """
     found = pair_specs(cohort)
     _require_apart(found, lambda pair: f"{pair.subject}/{pair.name}", "be called", "name")
     if cohort.layout == "learn2reg":
         whole = [pair for pair in found if not pair.problem]
-        _require_apart(whole, lambda pair: _submission(pair), "be submitted as", "moving image")
+        _require_apart(whole, _submission, "be submitted as", "moving image")
     resolve = _resolver(cohort)
     jobs: list[Job] = []
-    problems: list[Problem] = []
+    problems: list[Failure] = []
     for pair in found:
         sentence = pair.problem or _missing(pair)
         if sentence:
-            problems.append(Problem(pair.name, sentence))
+            problems.append(Failure(pair.name, sentence))
         else:
             jobs.append(_job(pair, cohort, resolve(pair)))
     return Plan(cohort.out, tuple(jobs), tuple(problems))
 
 
 def description() -> dict[str, Any]:
-    """Return what a cohort's folder says of itself, in the words of BIDS for derived data."""
+    """Return the description of a cohort's folder, as BIDS asks for derived data."""
     return {
         "Name": "Registrations by torchdeform",
         "BIDSVersion": "1.10.0",
@@ -140,7 +139,7 @@ def description() -> dict[str, Any]:
 
 
 def _require_apart(found: Sequence[PairSpec], place: Callable[[PairSpec], str], verb: str, remedy: str) -> None:
-    """Raise `InputError` if two pairs would write one place; capitals do not count, as on some disks."""
+    """Raise `InputError` if two pairs would write the same place. Case is ignored, as some file systems do."""
     seen: dict[str, PairSpec] = {}
     for pair in found:
         key = place(pair)
@@ -158,7 +157,7 @@ def _between(pair: PairSpec) -> str:
 
 
 def _resolver(cohort: Cohort) -> Callable[[PairSpec], RegistrationSettings]:
-    """Return what resolves a pair's settings, each set of them once."""
+    """Return a function that completes the settings of a pair; pairs with equal settings share one object."""
     known: dict[str, RegistrationSettings] = {}
 
     def resolve(pair: PairSpec) -> RegistrationSettings:
@@ -174,9 +173,9 @@ def _resolver(cohort: Cohort) -> Callable[[PairSpec], RegistrationSettings]:
 
 
 def _missing(pair: PairSpec) -> str:
-    """Return what files a pair lacks, as a sentence, empty if none."""
+    """Return a sentence about the files that a pair lacks, empty if there are all."""
     for key, path in pair.files.items():
-        if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises where a folder may not be looked into
+        if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises if a folder may not be read
             return f"{key} {path} does not exist; check {pair.where}"
     for what in ("points", "labels"):
         given = [side for side in ("fixed", "moving") if f"{side}_{what}" in pair.files]
@@ -195,7 +194,7 @@ def _job(pair: PairSpec, cohort: Cohort, settings: RegistrationSettings) -> Job:
         device=cohort.device,
         memory=cohort.memory,
         submission=cohort.out / SUBMISSION / _submission(pair) if cohort.layout == "learn2reg" else None,
-        voxels=pair.voxels and pair.files.keys() >= {"fixed_points", "moving_points"},
+        voxels=pair.voxels and pair.files.keys() >= {*_POINTS},
     )
 
 
@@ -203,11 +202,8 @@ def _submission(pair: PairSpec) -> str:
     return submission_name(pair.files["fixed"], pair.files["moving"])
 
 
-_POINTS = ("fixed_points", "moving_points")
-
-
 def register_job(job: Job, *, callback: Callback | None = None) -> Outcome:
-    """Register a pair as `register_files` does, and write what else its cohort wants of it.
+    """Register a pair as `register_files` does, and write the file of its submission if there is one.
 
     Raises:
         InputError: see `register_files`.
@@ -223,7 +219,7 @@ def register_job(job: Job, *, callback: Callback | None = None) -> Outcome:
 
 
 def _with_titles(files: PairFiles) -> PairFiles:
-    """Return the files with landmarks written anew into the pair's folder, titled i, j, k as `read_points` wants it."""
+    """Write the landmarks into the pair's folder with the titles i, j, k for `read_points`; return the new files."""
     given = {key: path for key in _POINTS if (path := getattr(files, key)) is not None}
     with atomic_folder(files.out) as folder:
         for key, path in given.items():

@@ -1,4 +1,4 @@
-"""The cohort file: what it may say, strictly typed, and how it is read."""
+"""The cohort file: its keys, strictly typed, and how it is read."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -31,12 +31,12 @@ from torchdeform.pipeline.config import (
     read_yaml_lines,
     to_yaml,
 )
-from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.settings import SHORT_FORMS, RegistrationSettings
 
-# Keys of what goes along with an image, and how a pair calls it after its side.
+# Companions of an image by their keys here, with their names in a pair.
 COMPANIONS = {"labels": "labels", "masks": "mask", "points": "points"}
 
-# Keys that mean something for one pairing only.
+# Keys that belong to one pairing only.
 _BELONGS = {
     **dict.fromkeys(("fixed", "fixed_labels", "fixed_mask", "fixed_points"), "template"),
     "reference": "group",
@@ -47,11 +47,10 @@ _LONGEST = 80  # characters of a wrong value that are shown
 
 
 def checked_name(name: str) -> str:
-    """Return a name that a folder can have on any system, `InputError` if it is none."""
+    """Return a name that a folder can have on any system; `InputError` if it is none."""
     if not _NAME.fullmatch(name):
-        raise InputError(
-            f"a name has letters, digits, '.', '_' and '-' only and begins with a letter or digit: {name!r}"
-        )
+        allowed = "letters, digits, '.', '_' and '-' only and starts with a letter or digit"
+        raise InputError(f"a name has {allowed}: {name!r}")
     return name
 
 
@@ -78,7 +77,19 @@ def _checked_expression(expression: str, name: str = "expression") -> str:
     return expression
 
 
-Overrides = Annotated[dict[str, Any], WithJsonSchema(TypeAdapter(RegistrationSettings).json_schema())]
+def _settings_schema() -> dict[str, Any]:
+    """Return the JSON Schema of settings with each group in its place, or the one value that stands for it."""
+    schema = TypeAdapter(RegistrationSettings).json_schema()
+    groups = schema.pop("$defs")
+    for name, field in schema["properties"].items():
+        if "$ref" in field:
+            group = groups[field.pop("$ref").rpartition("/")[2]]
+            short = [group["properties"][SHORT_FORMS[name]]] if name in SHORT_FORMS else []
+            field["anyOf"] = [group, *short]
+    return schema
+
+
+Overrides = Annotated[dict[str, Any], WithJsonSchema(_settings_schema())]
 Patterns = Annotated[
     tuple[Pattern, ...],
     BeforeValidator(_several),
@@ -98,7 +109,7 @@ class Pair(Strict):
     moving: Place
     """Image that is warped onto it."""
     name: Name | None = None
-    """Of the pair; from-MOVING_to-FIXED if not given."""
+    """Of the pair; by default from-MOVING_to-FIXED."""
     fixed_mask: Place | None = None
     """Where the fixed image counts (not 0)."""
     moving_mask: Place | None = None
@@ -116,25 +127,25 @@ class Pair(Strict):
 
 
 class Table(Strict):
-    """Pairs that stand in a table, one a row."""
+    """Pairs in a table, one per row."""
 
     file: Place
-    """CSV or TSV; columns are the keys of a pair, and settings.KEY for settings that differ. Cells may be empty."""
+    """CSV or TSV; its columns are the keys of a pair, and settings.KEY for settings that differ. Cells may be empty."""
 
 
 class Images(Strict):
-    """Images that patterns or a regular expression find, with parts of their paths named."""
+    """Images that patterns or a regular expression find, with named parts of their paths."""
 
     files: Patterns = ()
-    """A pattern of paths, or several: *, ?, [abc], ** for any folders, {part} for a part with a name."""
+    """A pattern of paths, or several: *, ?, [abc], ** for any folders, {part} for a named part."""
     expression: Expression | None = None
     """Regular expression with named groups (?P<part>...), instead of files, for the whole path below the folder."""
     folder: Place | None = None
-    """Folder that is searched with the expression."""
+    """Folder to search with the expression."""
     parts: Parts = Field(default_factory=dict)
-    """What a part may be, as a regular expression by its name; anything but / if not given."""
+    """Regular expressions that parts must match, by name; by default anything but /."""
     labels: Pattern | None = None
-    """Pattern of an image's regions, with {part} for the parts of the image's own path."""
+    """Pattern of an image's labels, with {part} for the parts of the image's own path."""
     masks: Pattern | None = None
     """Pattern of an image's mask."""
     points: Pattern | None = None
@@ -145,7 +156,7 @@ class Images(Strict):
         if bool(self.files) == (self.expression is not None):
             raise InputError("give either files (patterns) or expression (a regular expression)")
         if (self.expression is None) != (self.folder is None):
-            raise InputError("expression needs folder, and folder stands with expression only")
+            raise InputError("expression needs folder, and folder is for expression only; give both or neither")
         require_parts(tuple(self.parts), self.part_names(), "parts")
         for name, pattern in self.companions().items():
             require_parts(part_names(pattern), self.part_names(), name)
@@ -159,7 +170,7 @@ class Images(Strict):
         return tuple(name for name in first if all(name in names for names in others))
 
     def companions(self) -> dict[str, str]:
-        """Return the patterns of what goes along with an image, by their keys here."""
+        """Return the patterns of an image's companions, by their keys here."""
         return {key: value for key in COMPANIONS if (value := getattr(self, key)) is not None}
 
 
@@ -167,24 +178,24 @@ class PatternPairs(Images):
     """Pairs among the images that patterns find."""
 
     pairing: Literal["template", "consecutive", "all", "group"]
-    """template: each image to one fixed image. consecutive: each to the one before it. all: every two. group: each to a
+    """template: each image to one fixed image. consecutive: each to the one before. all: every two. group: each to one
     member of its group."""
     within: tuple[str, ...] = ()
-    """Parts that the images of a group share; all images are one group if none is named."""
+    """Parts that the images of a group share; without them all images are one group."""
     order: str | None = None
-    """Part by which the images of a group are sorted; by their paths if not given."""
+    """Part by which the images of a group are sorted; by default their paths."""
     fixed: Pattern | None = None
-    """template: the fixed image; {part} is that of the moving image."""
+    """template: the fixed image; {part} is the part of the moving image."""
     fixed_labels: Pattern | None = None
-    """template: its regions."""
+    """template: its labels."""
     fixed_mask: Pattern | None = None
     """template: its mask."""
     fixed_points: Pattern | None = None
     """template: its landmarks."""
     reference: dict[str, str] = Field(default_factory=dict)
-    """group: parts of the member that stays, such as {session: pre}."""
+    """group: parts of the fixed member, such as {session: pre}."""
     both_ways: bool = False
-    """all: register every two both ways, instead of the earlier one as fixed only."""
+    """all: register every two in both directions, instead of only with the earlier one as fixed."""
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -196,13 +207,13 @@ class PatternPairs(Images):
             require_parts(part_names(pattern), known, name)
         for key, pairing in _BELONGS.items():
             if getattr(self, key) and self.pairing != pairing:
-                raise InputError(f"{key} stands with pairing: {pairing} only, not with {self.pairing}")
+                raise InputError(f"{key} is for pairing: {pairing} only, not for {self.pairing}; remove it")
         for key in {"template": ("fixed",), "group": ("reference",)}.get(self.pairing, ()):
             if not getattr(self, key):
                 raise InputError(f"pairing: {self.pairing} needs {key}")
         for one, other in (("labels", "fixed_labels"), ("points", "fixed_points")):
             if self.pairing == "template" and (getattr(self, one) is None) != (getattr(self, other) is None):
-                raise InputError(f"{one} and {other} stand together: what they say is compared; give both or neither")
+                raise InputError(f"{one} and {other} are compared with each other; give both or neither")
         return self
 
     def fixed_files(self) -> dict[str, str]:
@@ -221,14 +232,14 @@ class Learn2Reg(Strict):
 
 
 class Pairs(Strict):
-    """Where the pairs come from: one of four ways."""
+    """The pairs, given in one of four ways."""
 
     list: tuple[Pair, ...] | None = None
     """One by one."""
     table: Table | None = None
     """From a CSV or TSV file."""
     pattern: PatternPairs | None = None
-    """From the names of files."""
+    """From the paths of files."""
     learn2reg: Learn2Reg | None = None
     """From a Learn2Reg data set."""
 
@@ -236,14 +247,13 @@ class Pairs(Strict):
     def _one_way(self) -> Self:
         given = [name for name in type(self).model_fields if getattr(self, name) is not None]
         if len(given) != 1:
-            raise InputError(
-                f"pairs come from one of list, table, pattern and learn2reg, got {', '.join(given) or 'none'}"
-            )
+            found = ", ".join(given) or "none"
+            raise InputError(f"pairs come from one of list, table, pattern and learn2reg, got {found}")
         return self
 
 
 class Cohort(Strict):
-    """What a cohort file says, every path absolute."""
+    """The content of a cohort file, with absolute paths."""
 
     out: Place
     """Folder of the results."""
@@ -258,11 +268,11 @@ class Cohort(Strict):
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where a pair is registered."""
     memory: Size | None = None
-    """Memory of a pair at most, such as 4GB; a pair that needs more is registered on a coarser grid."""
+    """Limit of memory of a pair, such as 4GB; a pair that needs more is registered on a coarser grid."""
     engine: EngineSettings = Field(default_factory=EngineSettings)
     """Where the pairs run."""
     layout: Literal["derivatives", "learn2reg"] = "derivatives"
-    """derivatives: a folder of results per pair. learn2reg: the submission of the challenge beside them."""
+    """derivatives: a folder of results per pair. learn2reg: in addition a submission to the challenge."""
     template: TemplateSettings = Field(default_factory=TemplateSettings)
     """How a template is made."""
 
@@ -278,16 +288,16 @@ class Cohort(Strict):
         return load_settings(self.preset, overrides=merged_settings(self.settings, overrides or {}))
 
     def to_yaml(self) -> str:
-        """Return the cohort as a file that says everything: paths absolute, variables filled in, all settings."""
+        """Return the cohort as a complete file: absolute paths, variables filled in, all settings."""
         content = self.model_dump(mode="json", exclude_none=True)
         return to_yaml(content | {"settings": asdict(self.resolve())})
 
 
 def read_cohort(path: Path) -> Cohort:
-    """Return what a cohort file says.
+    """Return the content of a cohort file.
 
     Raises:
-        InputError: the file cannot be read, or what is wrong in it first, with its line and the keys that lead there.
+        InputError: the file cannot be read, or the first thing that is wrong in it, with its line and keys.
     """
     content, lines = read_yaml(path), read_yaml_lines(path)
     try:
@@ -301,13 +311,13 @@ def read_cohort(path: Path) -> Cohort:
 
 
 def cohort_schema() -> dict[str, Any]:
-    """Return the JSON Schema of a cohort file, for editors that complete and check while one types."""
+    """Return the JSON Schema of a cohort file, with which editors complete and check it."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **Cohort.model_json_schema()}
     return schema | {"title": "torchdeform cohort"}
 
 
 def _overrides(cohort: Cohort) -> Iterator[tuple[tuple[str | int, ...], dict[str, Any]]]:
-    """Yield all settings that a file holds, and the keys that lead to them."""
+    """Yield all settings in a file, with the keys that lead to them."""
     yield ("settings",), cohort.settings
     for position, pair in enumerate((cohort.pairs.list if cohort.pairs else None) or ()):
         if pair.settings:
@@ -326,7 +336,7 @@ def _require_settings(cohort: Cohort, keys: tuple[str | int, ...], overrides: di
 
 
 def _explain(error: ValidationError, path: Path, lines: Lines) -> str:
-    """Return the sentence about the first thing that is wrong; a key that is not known comes before what it misses."""
+    """Return the sentence about the first error. An unknown key comes first: it is often a misspelt missing one."""
     errors = error.errors(include_url=False)
     first = next((one for one in errors if one["type"] == "extra_forbidden"), errors[0])
     keys: tuple[str | int, ...] = ()
@@ -361,7 +371,7 @@ def _dotted(keys: tuple[str | int, ...]) -> str:
 
 
 def _known_keys(keys: tuple[str | int, ...]) -> list[str]:
-    """Return the keys that may stand where these keys lead; positions and the names of unions' members lead nowhere."""
+    """Return the keys that are allowed at this place; positions and names of union members are skipped."""
     models: list[type[BaseModel]] = [Cohort]
     for key in keys:
         inside = [m for model in models if key in model.model_fields for m in _models(model.model_fields[str(key)])]

@@ -1,4 +1,4 @@
-"""Settings of the engine that runs a cohort's pairs."""
+"""Parts of the cohort file: types of paths, patterns and sizes, and the settings of the engine and of a template."""
 
 import os
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from torchdeform.registration.template import AveragingSettings, Pose
 
 
 class Strict(BaseModel):
-    """A record that cannot be changed, with no key but its own and no value of another type."""
+    """A frozen record that refuses unknown keys and values of another type."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
@@ -30,7 +30,7 @@ def expand(text: str) -> str:
 
 
 def expand_pattern(text: str) -> str:
-    """Return a pattern, expanded as by `expand`; what the variables hold is taken literally."""
+    """Return a pattern expanded as by `expand`; the values of the variables are no patterns."""
     return _substitute(text, literal)
 
 
@@ -42,11 +42,11 @@ def _substitute(text: str, form: Callable[[str], str]) -> str:
     except KeyError as error:
         raise InputError(f"the environment variable {error.args[0]} is not set; set it, or write the path") from error
     except ValueError as error:
-        raise InputError(f"{text!r} has a $ before no variable's name; write $$ for a dollar sign") from error
+        raise InputError(f"{text!r} has a $ without the name of a variable; write $$ for a dollar sign") from error
 
 
 def _folder(info: ValidationInfo) -> Path:
-    """Return the folder of the cohort file, to which its paths are relative."""
+    """Return the folder of the cohort file; its paths are relative to it."""
     return (info.context or {}).get("folder", Path())
 
 
@@ -57,19 +57,19 @@ def _text(value: object) -> str:
 
 
 def place(value: object, info: ValidationInfo) -> Path:
-    """Return the path that a text of the file stands for."""
-    return beside(_folder(info), expand(_text(value)))
+    """Return the absolute path for a text of the file."""
+    return absolute_path(_folder(info), expand(_text(value)))
 
 
 def pattern(value: object, info: ValidationInfo) -> str:
-    """Return the absolute pattern that a text of the file stands for."""
+    """Return the absolute pattern for a text of the file."""
     text = expand_pattern(_text(value))
     part_names(text)
-    return beside(Path(literal(_folder(info).as_posix())), text).as_posix()
+    return absolute_path(Path(literal(_folder(info).as_posix())), text).as_posix()
 
 
-def beside(folder: Path, text: str) -> Path:
-    """Return a path as it is if it is absolute, else below ``folder``; ``../`` at its beginning leads out of there."""
+def absolute_path(folder: Path, text: str) -> Path:
+    """Return an absolute path as it is, another one below ``folder``; ``../`` at the start goes up from there."""
     path = Path(text).expanduser()
     while path.parts[:1] == ("..",):
         folder, path = folder.parent, Path(*path.parts[1:])
@@ -80,40 +80,29 @@ def _size(value: object) -> object:
     return parse_size(value) if isinstance(value, str) else value
 
 
-_written = PlainSerializer(lambda value: str(value).replace("$", "$$"), return_type=str, when_used="json")
-
-
-Place = Annotated[Path, BeforeValidator(place), _written]
-
-
-Pattern = Annotated[str, BeforeValidator(pattern), _written]
-
-
-Size = Annotated[int, BeforeValidator(_size), Field(gt=0)]
-
-
-Count = Annotated[int, Field(ge=1)]
-
-
-Seconds = Annotated[float, Field(gt=0)]
-
-
 def _scheduler(value: object, info: ValidationInfo) -> object:
-    """Return the address of a scheduler with its variables filled in, or the whole path of a scheduler file."""
+    """Return the address of a scheduler with its variables filled in, or the absolute path of a scheduler file."""
     if not isinstance(value, str):
         return value
     text = expand(value)
     return str(place(value, info)) if text.endswith(".json") else text
 
 
+_written = PlainSerializer(lambda value: str(value).replace("$", "$$"), return_type=str, when_used="json")
+
+Place = Annotated[Path, BeforeValidator(place), _written]
+Pattern = Annotated[str, BeforeValidator(pattern), _written]
+Size = Annotated[int, BeforeValidator(_size), Field(gt=0)]
+Count = Annotated[int, Field(ge=1)]
+Seconds = Annotated[float, Field(gt=0)]
 Scheduler = Annotated[str, BeforeValidator(_scheduler)]
 
 
 class ClusterSettings(Strict):
-    """A cluster that is started for the run and stopped after it."""
+    """A cluster that starts and stops with the run."""
 
     kind: Literal["local", "slurm", "pbs", "lsf"]
-    """Who starts the workers: this machine, or a queue by dask-jobqueue."""
+    """Where the workers run: on this machine, or in a queue by dask-jobqueue."""
     jobs: Count = 1
     """Jobs in the queue at a time, each with a worker process; worker processes, on a local cluster."""
     workers: Count = 1
@@ -125,11 +114,11 @@ class ClusterSettings(Strict):
     gpus: Annotated[int, Field(ge=0)] = 0
     """GPUs of a job; each pair takes one."""
     walltime: str | None = None
-    """How long a job may last, as the queue writes it, such as 04:00:00; jobs that end are replaced."""
+    """Time limit of a job in the queue's notation, such as 04:00:00; jobs that end are replaced."""
     queue: str | None = None
     """Queue or partition."""
     account: str | None = None
-    """Account or project that pays."""
+    """Account or project to charge."""
     directives: tuple[str, ...] = ()
     """More options of the queue, such as --constraint=avx2."""
     prologue: tuple[str, ...] = ()
@@ -137,13 +126,12 @@ class ClusterSettings(Strict):
     interface: str | None = None
     """Network interface between jobs and this machine, such as ib0."""
     python: str | None = None
-    """Python of the jobs; that of this process if not given."""
+    """Python of the jobs; by default that of this process."""
 
     @model_validator(mode="after")
     def _divisible(self) -> Self:
         if self.gpus and self.workers > self.gpus:
             raise InputError(f"workers: each pair takes a GPU, so there can be {self.gpus} at most, got {self.workers}")
-
         if self.workers > self.cores:
             raise InputError(f"workers: {self.workers} pairs at a time need as many cores, and cores is {self.cores}")
         return self
@@ -153,13 +141,13 @@ class EngineSettings(Strict):
     """Where and how the pairs run."""
 
     kind: Literal["local", "dask"] = "local"
-    """local: processes of this machine. dask: a Dask cluster, by its scheduler or as described."""
+    """local: processes of this machine. dask: a Dask cluster, by its scheduler or as given in cluster."""
     workers: Count | Literal["auto"] = "auto"
-    """local: pairs at a time; auto takes what cores, GPUs and memory allow."""
+    """local: pairs at a time; auto: as many as cores, GPUs and memory allow."""
     threads: Count | Literal["auto"] = "auto"
-    """Threads of a pair; auto divides the cores among the pairs that run at a time."""
+    """Threads of a pair; auto: the cores divided among the pairs that run at a time."""
     timeout: Seconds = 14400.0
-    """Seconds after which a pair is given up."""
+    """Seconds after which a pair is stopped."""
     scheduler: Scheduler | None = None
     """dask: address of a scheduler, such as tcp://10.0.0.1:8786, or the path of its scheduler file, NAME.json."""
     cluster: ClusterSettings | None = None
@@ -169,11 +157,11 @@ class EngineSettings(Strict):
     def _one_engine(self) -> Self:
         given = [name for name in ("scheduler", "cluster") if getattr(self, name) is not None]
         if self.kind == "local" and given:
-            raise InputError(f"{given[0]} stands with kind: dask only")
+            raise InputError(f"{given[0]} is for kind: dask only; remove it, or set kind: dask")
         if self.kind == "dask" and len(given) != 1:
             raise InputError("kind: dask needs either scheduler (an address) or cluster (what to start)")
         if self.kind == "dask" and self.workers != "auto":
-            raise InputError("workers stands with kind: local; a Dask cluster has its own, see cluster.workers")
+            raise InputError("workers is for kind: local only; for a Dask cluster use cluster.workers")
         return self
 
 
@@ -183,19 +171,19 @@ class TemplateSettings(Strict):
     rounds: Annotated[int, Field(ge=1)] = 3
     """How often all images are registered, each time to the template of the round before."""
     reference: Place | None = None
-    """Image that the first round registers to, and whose grid the template gets; the first of images if not given."""
+    """Image that the first round registers to; the template gets its grid. By default the first of images."""
     pose: Pose = AveragingSettings.pose
-    """Where the template lies: reference, as that image does, or mean, in the mean position and orientation."""
+    """Position and orientation of the template: those of the reference, or the mean of all images."""
     match_intensities: bool = AveragingSettings.match_intensities
-    """Bring all images to one mean and one standard deviation before they are averaged."""
+    """Scale all images to one mean and one standard deviation before they are averaged."""
     corrections: Annotated[int, Field(ge=1)] = AveragingSettings.corrections
-    """How often at most the mean of the maps from the template is brought back to the identity in a round."""
+    """Corrections in a round at most that bring the mean of the maps from the template to the identity."""
     tolerance: Annotated[float, Field(ge=0)] = AveragingSettings.tolerance
-    """Largest move of that mean, in voxels, that counts as none."""
+    """Largest displacement of that mean, in voxels, that counts as the identity."""
 
     @property
     def averaging(self) -> AveragingSettings:
-        """What the averages of a round need."""
+        """The settings for the averages of a round."""
         return AveragingSettings(
             pose=self.pose,
             match_intensities=self.match_intensities,

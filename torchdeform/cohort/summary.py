@@ -1,4 +1,4 @@
-"""The outcome of a cohort: a table of all pairs, one of those that failed, and a page that shows both."""
+"""The outcome of a cohort: a table of all pairs, a table of those that failed, and a page with both."""
 
 import csv
 import os
@@ -8,25 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from torchdeform import __version__
-from torchdeform.cohort.plan import Job, Problem
-from torchdeform.cohort.task import DONE, FAILED, Report
+from torchdeform.cohort.plan import Failure, Job
+from torchdeform.cohort.task import DONE, FAILED, FIGURES, PairReport
+from torchdeform.io.files import atomic_folder
 
 SUMMARY, FAILURES, PAGE = "summary.csv", "failures.csv", "index.html"
 WAITING = "waiting"
 
-FIGURES = (
-    "similarity_before",
-    "similarity_after",
-    "dice_before",
-    "dice_after",
-    "landmark_error_before",
-    "landmark_error_after",
-    "folds",
-    "determinant_min",
-    "determinant_max",
-    "inverse_error_mean",
-    "inverse_error_max",
-)
 COLUMNS = ("name", "status", *FIGURES, "seconds", "peak_memory_mb", "gpu_memory_mb", "folder")
 FAILURE_COLUMNS = ("name", "sentence", "log")
 
@@ -36,17 +24,8 @@ Row = Mapping[str, str | float]
 
 
 @dataclass(frozen=True)
-class Failure:
-    """A pair that failed: its name, a sentence that says why, and its log, None if it never ran."""
-
-    name: str
-    sentence: str
-    log: Path | None = None
-
-
-@dataclass(frozen=True)
 class Summary:
-    """What became of a cohort.
+    """The outcome of a cohort.
 
     Attributes:
         out: folder of its results.
@@ -67,28 +46,30 @@ class Summary:
 
 
 def log_of(out: Path, name: str) -> Path:
-    """Return the file for what a pair says while it runs."""
+    """Return the log file of a pair."""
     return out / _LOGS / f"{name}.log"
 
 
-def summarise(jobs: Sequence[Job], out: Path, known: Mapping[str, Report], problems: Iterable[Problem] = ()) -> Summary:
-    """Write ``summary.csv``, ``failures.csv`` and ``index.html``, and return what they come to.
+def summarise(
+    jobs: Sequence[Job], out: Path, known: Mapping[str, PairReport], problems: Iterable[Failure] = ()
+) -> Summary:
+    """Write ``summary.csv``, ``failures.csv`` and ``index.html``, and return their totals.
 
     Args:
-        jobs: all pairs that can run; those that are not known are waiting.
+        jobs: all pairs that can run; those without a report are waiting.
         out: folder of the cohort's results.
         known: reports by name.
         problems: pairs that cannot run.
     """
-    lacking = tuple(problems)
-    failures = [Failure(problem.name, problem.sentence) for problem in lacking]
+    problems = tuple(problems)
+    failures = [*problems]
     failures += [
         Failure(job.name, known[job.name].sentence, log_of(out, job.name))
         for job in jobs
         if job.name in known and known[job.name].status == FAILED
     ]
-    rows = [_row(job, out, known.get(job.name, Report(WAITING))) for job in jobs]
-    rows += [dict.fromkeys(COLUMNS, "") | {"name": problem.name, "status": FAILED} for problem in lacking]
+    rows = [_row(job, out, known.get(job.name, PairReport(WAITING))) for job in jobs]
+    rows += [dict.fromkeys(COLUMNS, "") | {"name": problem.name, "status": FAILED} for problem in problems]
     _write_table(out / SUMMARY, COLUMNS, rows)
     _write_table(out / FAILURES, FAILURE_COLUMNS, [_failure_row(failure, out) for failure in failures])
     write_page(out / PAGE, rows, failures)
@@ -96,7 +77,7 @@ def summarise(jobs: Sequence[Job], out: Path, known: Mapping[str, Report], probl
     return Summary(out, counts.count(DONE), counts.count(WAITING), tuple(failures))
 
 
-def _row(job: Job, out: Path, report: Report) -> Row:
+def _row(job: Job, out: Path, report: PairReport) -> Row:
     folder = os.path.relpath(job.files.out, out) if report.status == DONE else ""
     figures = {name: report.figures.get(name, "") for name in FIGURES}
     costs = {
@@ -113,27 +94,24 @@ def _failure_row(failure: Failure, out: Path) -> Row:
 
 
 def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
-    """Write a table that appears whole."""
-    part = path.with_name(f".{path.name}.part")
-    with part.open("w", encoding="utf-8", newline="") as file:
+    """Write a table that appears complete or not at all."""
+    with atomic_folder(path.parent) as folder, (folder / path.name).open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    part.replace(path)
 
 
 _TEMPLATES = Path(__file__).parent / "templates"
-_SHOWN = ("report.html", "overview.png")  # what a pair's name leads to, the first that is there
-_STATUSES = ("done", "failed", "waiting")
+_SHOWN = ("report.html", "overview.png")  # the first that exists is linked from the name of a pair
 
 
 def write_page(path: Path, rows: Sequence[Row], failures: Iterable[Failure]) -> None:
-    """Write the page of a cohort; every text in it is escaped.
+    """Write the page of a cohort; all text is escaped.
 
     Args:
         path: the file; links are relative to its folder.
         rows: of the summary, all with the same columns.
-        failures: what failed, with sentences and logs.
+        failures: the pairs that failed.
     """
     from jinja2 import Environment, FileSystemLoader
 
@@ -144,30 +122,28 @@ def write_page(path: Path, rows: Sequence[Row], failures: Iterable[Failure]) -> 
     text = environment.get_template(path.name).stream(
         columns=[column for column in _columns(rows) if column not in ("name", "status", "folder")],
         rows=({"cells": row, "link": _link(path.parent, row), **_trouble(path.parent, row, why)} for row in rows),
-        counts={status: statuses.count(status) for status in _STATUSES},
+        counts={status: statuses.count(status) for status in (DONE, FAILED, WAITING)},
         title=path.absolute().parent.name,
         version=__version__,
     )
-    part = path.with_name(f".{path.name}.part")
-    with part.open("w", encoding="utf-8") as file:
+    with atomic_folder(path.parent) as folder, (folder / path.name).open("w", encoding="utf-8") as file:
         file.writelines(text)
-    part.replace(path)
 
 
 def _columns(rows: Sequence[Row]) -> list[str]:
-    """Return the columns that some pair has a figure in."""
+    """Return the columns that are not empty for all pairs."""
     return [column for column in (rows[0] if rows else ()) if any(row[column] != "" for row in rows)]
 
 
 def _link(folder: Path, row: Row) -> str:
-    """Return what a pair's name leads to, relative to the page; empty if there is nothing."""
+    """Return the file that a pair's name links to, relative to the page; empty if there is none."""
     if not row["folder"]:
         return ""
     return next((f"{row['folder']}/{name}" for name in _SHOWN if (folder / str(row["folder"]) / name).is_file()), "")
 
 
 def _trouble(folder: Path, row: Row, why: Mapping[str, Failure]) -> dict[str, Any]:
-    failure = why.get(str(row["name"])) if row["status"] == "failed" else None
+    failure = why.get(str(row["name"])) if row["status"] == FAILED else None
     if failure is None:
         return {"sentence": "", "log": ""}
     log = failure.log

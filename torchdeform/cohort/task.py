@@ -1,4 +1,4 @@
-"""One pair in a worker process: registered, logged, and told about in a few numbers."""
+"""One pair in a worker process: registered, logged, and reported in a few numbers."""
 
 import faulthandler
 import os
@@ -18,39 +18,43 @@ from torchdeform.pipeline.memory import peak
 
 DONE, FAILED = "done", "failed"
 
-# Figures of a pair's record that go into the summary as they are.
-_FIGURES = (
+# Figures of a pair in the summary, most of them with their names in the pair's record.
+FIGURES = (
     "similarity_before",
     "similarity_after",
+    "dice_before",
+    "dice_after",
+    "landmark_error_before",
+    "landmark_error_after",
     "folds",
     "determinant_min",
     "determinant_max",
     "inverse_error_mean",
     "inverse_error_max",
 )
-# What was measured before and after, by its name in the summary.
+# The names in the record of the figures that are measured before and after.
 _MEASURED = {"dice": "dice_mean", "landmark_error": "landmark_error_mean"}
 
 
 @dataclass(frozen=True)
 class Task:
-    """A job, and the file for what it says while it runs."""
+    """A job and its log file."""
 
     job: Job
     log: Path
 
 
 @dataclass(frozen=True)
-class Report:
-    """What became of a pair, small enough to travel.
+class PairReport:
+    """The outcome of a pair, small enough to be sent between processes.
 
     Attributes:
         status: ``done`` or ``failed``.
         sentence: why it failed, and what to do.
-        seconds: wall time of the registration, files read and written among it.
-        peak_memory: bytes that the process held at most, 0 if unknown.
-        gpu_memory: bytes that it held on the GPU at most.
-        figures: the summary's numbers by column; what was not measured is missing.
+        seconds: wall time of the registration, with reading and writing files.
+        peak_memory: peak memory of the process in bytes, 0 if unknown.
+        gpu_memory: peak memory on the GPU in bytes.
+        figures: numbers for the summary by column, without those that were not measured.
         files: names of the results in the pair's folder.
     """
 
@@ -63,50 +67,49 @@ class Report:
     files: tuple[str, ...] = ()
 
 
-def perform(task: Task) -> Report:
-    """Register a pair and report; whatever goes wrong short of the end of the process is a report as well.
+def perform(task: Task) -> PairReport:
+    """Register a pair and report. Every error but the end of the process becomes a report, too.
 
     Notes:
-        All that the process prints meanwhile goes to the log, a crash's traceback among it.
+        Everything that the process prints in that time goes to the log, even the traceback of a crash.
     """
     start = perf_counter()
     with _logged(task.log):
-        _say(task.job)
-        _forget_peak()
+        _log_job(task.job)
+        _reset_peaks()
         try:
             report = _register(task.job, start)
-        except Exception as error:  # noqa: BLE001 - one pair's failure is its own
-            report = Report(FAILED, _sentence(error), perf_counter() - start, *_peaks())
+        except Exception as error:  # noqa: BLE001 - an error of one pair must not stop the others
+            report = PairReport(FAILED, _sentence(error), perf_counter() - start, *_peaks())
         sys.stderr.write(f"{strftime('%FT%T')} {report.status} {report.sentence}\n")
         return report
 
 
-def _register(job: Job, start: float) -> Report:
+def _register(job: Job, start: float) -> PairReport:
     outcome = register_job(job)
     for warning in outcome.record["warnings"]:
         sys.stderr.write(f"warning: {warning}\n")
-    return Report(DONE, "", perf_counter() - start, *_peaks(), _figures(outcome.record), outcome.record["files"])
+    return PairReport(DONE, "", perf_counter() - start, *_peaks(), _figures(outcome.record), outcome.record["files"])
 
 
 def _sentence(error: Exception) -> str:
-    """Return what to tell about an error; the traceback of one that nobody foresaw goes to the log."""
+    """Return the sentence about an error; the traceback goes to the log unless the input is wrong."""
     if not isinstance(error, InputError):
         traceback.print_exception(error)
     return explain(error)[0]
 
 
 def _figures(record: dict[str, Any]) -> dict[str, float]:
-    found = {name: record[name] for name in _FIGURES}
-    for column, key in _MEASURED.items():
-        for stage in ("before", "after"):
-            value = record["evaluation"].get(stage, {}).get(key)
-            if value is not None:
-                found[f"{column}_{stage}"] = value
-    return found
+    measured = {
+        f"{column}_{stage}": record["evaluation"].get(stage, {}).get(key)
+        for column, key in _MEASURED.items()
+        for stage in ("before", "after")
+    }
+    return {name: value for name in FIGURES if (value := (record | measured)[name]) is not None}
 
 
-def _say(job: Job) -> None:
-    """Write into the log what runs, and where."""
+def _log_job(job: Job) -> None:
+    """Write the job, the machine and the process into the log."""
     lines = [f"{strftime('%FT%T')} {job.name} on {platform.node()}, process {os.getpid()}"]
     given = ((f.name, getattr(job.files, f.name)) for f in fields(job.files))
     lines += [f"  {name}: {path}" for name, path in given if path is not None]
@@ -115,30 +118,30 @@ def _say(job: Job) -> None:
 
 @contextmanager
 def _logged(log: Path) -> Iterator[None]:
-    """Send what this process prints, its C libraries included, to the end of a file."""
+    """Append everything that this process prints, also from C libraries, to a file."""
     log.parent.mkdir(parents=True, exist_ok=True)
-    kept = [os.dup(descriptor) for descriptor in (1, 2)]
+    saved = [os.dup(descriptor) for descriptor in (1, 2)]
     with log.open("a", encoding="utf-8") as file:
-        _turn([file.fileno()] * 2)
+        _redirect([file.fileno()] * 2)
         faulthandler.enable(file)
         try:
             yield
         finally:
             faulthandler.disable()
-            _turn(kept)
-            for descriptor in kept:
+            _redirect(saved)
+            for descriptor in saved:
                 os.close(descriptor)
 
 
-def _turn(targets: list[int]) -> None:
+def _redirect(targets: list[int]) -> None:
     for stream, descriptor, target in zip((sys.stdout, sys.stderr), (1, 2), targets, strict=True):
         with suppress(OSError, ValueError):
             stream.flush()
         os.dup2(target, descriptor)
 
 
-def _forget_peak() -> None:
-    """Let the peak of this process count from now, where Linux can (elsewhere it is the peak of all its pairs)."""
+def _reset_peaks() -> None:
+    """Start the peak memory of this process anew; Linux only, elsewhere it is the peak over all its pairs."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     if (cuda := _cuda()) is not None:
@@ -146,13 +149,13 @@ def _forget_peak() -> None:
 
 
 def _peaks() -> tuple[int, int]:
-    """Return the peaks of this process's memory and of its GPU's, in bytes."""
+    """Return the peak memory of this process and on its GPU, in bytes."""
     cuda = _cuda()
     return peak() or 0, 0 if cuda is None else cuda.max_memory_allocated()
 
 
 def _cuda() -> Any:
-    """Return torch's CUDA if it is in use, else None."""
+    """Return ``torch.cuda`` if it is in use, else None."""
     import torch
 
     return torch.cuda if torch.cuda.is_initialized() else None

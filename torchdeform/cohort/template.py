@@ -1,4 +1,4 @@
-"""A template of image files: each round's registrations as the pairs of a run, averaged, and the files of the last."""
+"""A template of image files: in each round all images are registered and averaged; the last round is published."""
 
 import hashlib
 import json
@@ -26,7 +26,7 @@ from torchdeform.io.labels import read_labels, write_labels
 from torchdeform.pipeline.register import PairFiles, choose_device
 from torchdeform.registration.template import Lazy, Template, identity_map, make_template
 from torchdeform.report.figures import write_gallery
-from torchdeform.report.record import versions, write_json
+from torchdeform.report.record import describe_map, versions, write_json
 
 TEMPLATE, OVERVIEW, RECORD = "template.nii.gz", "overview.png", "result.json"
 SUBJECTS, ROUNDS = "subjects", "rounds"
@@ -35,12 +35,12 @@ _TRANSFORM, _INVERSE, _WARPED = "transform.h5", "inverse.h5", "warped"
 _ROUND, _PAIRS = "round.json", "pairs"
 _FEWEST = 2  # images
 
-Report = Callable[[int, Event], None]
+Listener = Callable[[int, Event], None]
 
 
 @dataclass(frozen=True)
 class Subject:
-    """An image of a template: its name, its file, where it counts, and its regions."""
+    """An image of a template: its name and its files."""
 
     name: str
     image: Path
@@ -50,12 +50,12 @@ class Subject:
 
 @dataclass(frozen=True)
 class Built:
-    """What became of a template.
+    """The results of a template.
 
     Attributes:
         folder: of the results.
-        record: what ``result.json`` holds.
-        failures: images that are not part of it, and why.
+        record: the content of ``result.json``.
+        failures: images that could not be registered, and why.
     """
 
     folder: Path
@@ -71,8 +71,8 @@ class Round:
         number: from 1.
         folder: of its registrations and its template.
         reference: the image that all others are registered to.
-        subjects: the images that take part.
-        key: a hash of all that its template depends on.
+        subjects: the images of the round.
+        key: a hash of everything that its template depends on.
     """
 
     number: int
@@ -87,24 +87,24 @@ class Round:
         return folder / _PAIRS / name
 
 
-def build(cohort: Cohort, *, retry_failed: bool = False, report: Report | None = None) -> Built:
-    """Make the template of a cohort's images; what an earlier run has done is not done again.
+def build(cohort: Cohort, *, retry_failed: bool = False, report: Listener | None = None) -> Built:
+    """Make the template of a cohort's images; work of an earlier run is not repeated.
 
     Writes into ``cohort.out``: ``template.nii.gz``, ``overview.png`` and ``result.json``; for each image
-    ``subjects/NAME/`` with ``transform.h5`` (points: template to image; brings the image onto the template),
-    ``inverse.h5`` (the other way) and ``warped.*``; and ``rounds/N/`` with each round's registrations and template.
+    ``subjects/NAME/`` with ``transform.h5`` (maps points of the template to the image and warps the image onto the
+    template), ``inverse.h5`` (the other way) and ``warped.*``; and ``rounds/N/`` with the results of each round.
 
     Args:
         cohort: with ``images``.
-        retry_failed: register again what failed in an earlier run.
-        report: is told the number of the round and every event of its run.
+        retry_failed: also register images that failed in an earlier run.
+        report: is called with the number of the round and every event of its run.
 
     Raises:
         InputError: no images, fewer than two, or a folder that cannot be written.
         ComputationError: fewer than two images could be registered, or no mean shape without folds was found.
 
     Notes:
-        An image that cannot be registered in one round is left out of that round and of those after it.
+        An image that cannot be registered in one round is left out of this round and of all later ones.
     """
     subjects = _subjects(cohort)
     require_writable(cohort.out)
@@ -125,7 +125,7 @@ def _subjects(cohort: Cohort) -> tuple[Subject, ...]:
         for name, files in named_images(cohort).items()
     )
     if len(found) < _FEWEST:
-        raise InputError(f"{cohort.path}: a template needs {_FEWEST} images at least, got {len(found)}; check images")
+        raise InputError(f"{cohort.path}: a template needs at least {_FEWEST} images, got {len(found)}; check images")
     return found
 
 
@@ -135,14 +135,14 @@ def _register(
     reference: Path,
     subjects: Sequence[Subject],
     retry_failed: bool,
-    report: Report | None,
+    report: Listener | None,
 ) -> tuple[Round, tuple[Failure, ...]]:
-    """Register all images to the reference but itself; return the round of those that could be, and who could not."""
+    """Register all images but the reference to it; return the round of those that succeeded, and the failures."""
     folder = cohort.out / ROUNDS / str(number)
     jobs = {subject: _job(cohort, folder, reference, subject) for subject in subjects}
-    wanted = [job for subject, job in jobs.items() if subject.image != reference]
+    others = [job for subject, job in jobs.items() if subject.image != reference]
     listen = None if report is None else lambda event: report(number, event)
-    summary = run(wanted, folder, cohort.engine, retry_failed=retry_failed, report=listen)
+    summary = run(others, folder, cohort.engine, retry_failed=retry_failed, report=listen)
     missing = {failure.name for failure in summary.failures}
     left = {subject: job for subject, job in jobs.items() if subject.name not in missing}
     if len(left) < _FEWEST:
@@ -160,15 +160,15 @@ def _job(cohort: Cohort, folder: Path, reference: Path, subject: Subject) -> Job
 
 
 def _key(cohort: Cohort, folder: Path, jobs: Iterable[Job]) -> str:
-    """Return a hash of the content of all images, and of how they are registered and averaged."""
+    """Return a hash of all images and of how they are registered and averaged."""
     with Journal(folder) as journal:
-        prints = {job.name: journal.fingerprint(job) for job in jobs}
-    text = json.dumps([prints, asdict(cohort.template.averaging)], sort_keys=True)
+        fingerprints = {job.name: journal.fingerprint(job) for job in jobs}
+    text = json.dumps([fingerprints, asdict(cohort.template.averaging)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _average(current: Round, cohort: Cohort) -> Template | None:
-    """Write the template of a round; None where an earlier run did."""
+    """Make and write the template of a round; None if an earlier run did."""
     if _recorded(current.folder / _ROUND, current.key) and (current.folder / TEMPLATE).is_file():
         return None
     start = perf_counter()
@@ -188,7 +188,7 @@ def _average(current: Round, cohort: Cohort) -> Template | None:
 
 
 def _make(current: Round, cohort: Cohort) -> Template:
-    """Average what a round has registered, one image and one map at a time in memory."""
+    """Average the images and maps of a round, one image and one map in memory at a time."""
     where, subjects = choose_device(cohort.device), current.subjects
     reference = read_image(current.reference).to(where)
     images = Lazy(len(subjects), lambda i: read_image(subjects[i].image).to(where))
@@ -197,7 +197,7 @@ def _make(current: Round, cohort: Cohort) -> Template:
 
 
 def _read_map(current: Round, subject: Subject, reference: Image) -> Transform:
-    """Return the map from the reference to an image, its inverse being known."""
+    """Return the map from the reference to an image, with its inverse."""
     if subject.image == current.reference:
         return identity_map(reference)
     pair = Round.pair(current.folder, subject.name)
@@ -210,11 +210,11 @@ def _read_map(current: Round, subject: Subject, reference: Image) -> Transform:
 def _publish(
     rounds: Sequence[Round], template: Template | None, cohort: Cohort, failures: Sequence[Failure]
 ) -> Mapping[str, Any]:
-    """Write the template of the last round, and the map of every image to it, unless an earlier run did."""
+    """Write the template of the last round and the maps from it to every image, unless an earlier run did."""
     out, last = cohort.out, rounds[-1]
-    former = _recorded(out / RECORD, last.key)
-    if former and all((out / name).is_file() for name in former["files"]):
-        return former
+    earlier = _recorded(out / RECORD, last.key)
+    if earlier and all((out / name).is_file() for name in earlier["files"]):
+        return earlier
     template = template or _make(last, cohort)
     found = {s.name: _publish_subject(s, template.maps[i], template, out) for i, s in enumerate(last.subjects)}
     record = {
@@ -236,7 +236,7 @@ def _publish(
 
 
 def _publish_subject(subject: Subject, from_template: Transform, template: Template, out: Path) -> dict[str, Any]:
-    """Write the map of an image and the image on the template; return its place, its folds and determinants."""
+    """Write the map of an image and the image on the template; return its files, folds and determinants."""
     place = Path(SUBJECTS) / subject.name
     image, map_ = read_image(subject.image), from_template.to("cpu")
     warped = replace(map_.image(image, template.image.to("cpu")), pixel_type=image.pixel_type)
@@ -245,21 +245,16 @@ def _publish_subject(subject: Subject, from_template: Transform, template: Templ
         write_transform(map_.inverse(), folder / _INVERSE)
         write_image(warped, folder / f"{_WARPED}{ending_like(subject.image, warped)}")
         if subject.labels is not None:
-            carried = map_.labels(read_labels(subject.labels), template.image.to("cpu"))
-            write_labels(carried, folder / f"{_WARPED}_labels{ending_like(subject.labels, carried)}")
+            labels = map_.labels(read_labels(subject.labels), template.image.to("cpu"))
+            write_labels(labels, folder / f"{_WARPED}_labels{ending_like(subject.labels, labels)}")
         names = sorted(path.name for path in folder.iterdir())
-    return {"image": str(subject.image), **_judged(map_), "files": [str(place / name) for name in names]}
+    return {"image": str(subject.image), **_describe_map(map_), "files": [str(place / name) for name in names]}
 
 
-def _judged(map_: Transform) -> dict[str, Any]:
-    """Return folds and determinants of a map from the template, its affine parts left aside."""
+def _describe_map(map_: Transform) -> dict[str, Any]:
+    """Return folds and determinants of a map from the template, without its affine part."""
     back, ahead = (stage.field for stage in map_.stages if isinstance(stage, Displacement))
-    diagnosis = diagnose(compose(ahead.data, back.data, back.grid), back.grid)
-    return {
-        "folds": int(diagnosis.folds.item()),
-        "determinant_min": diagnosis.det_min.item(),
-        "determinant_max": diagnosis.det_max.item(),
-    }
+    return describe_map(diagnose(compose(ahead.data, back.data, back.grid), back.grid))
 
 
 def _recorded(path: Path, key: str) -> dict[str, Any] | None:

@@ -5,11 +5,12 @@ looks on, the methods of fixed steps are run from their tableaux here; a test sa
 """
 
 import math
-import threading
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import pairwise
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import torch
@@ -195,8 +196,7 @@ def integrate_rate(
         raise InputError("integrate: squaring follows a stationary velocity only; take method='rk4'")
     if torch.compiler.is_compiling() and solver.method in TABLEAUX and not solver.adjoint:
         return runge_kutta(rate, start, times, TABLEAUX[solver.method], solver.steps)
-    from torchdiffeq import odeint, odeint_adjoint
-
+    torchdiffeq = _torchdiffeq()
     t = torch.tensor(times, dtype=start.dtype, device=start.device)
     options = {"grid_constructor": _equal_steps(solver.steps)} if solver.steps > 1 else {}
     fixed = {"method": solver.method, "options": options}
@@ -204,9 +204,11 @@ def integrate_rate(
     backward = {} if settings is fixed else {"adjoint_method": "rk4", "adjoint_options": options}
     try:
         if solver.adjoint:
-            states: Any = odeint_adjoint(rate, start, t, **settings, **backward, adjoint_params=tuple(parameters))
+            states: Any = torchdiffeq.odeint_adjoint(
+                rate, start, t, **settings, **backward, adjoint_params=tuple(parameters)
+            )
         else:
-            states = odeint(rate, start, t, **settings)
+            states = torchdiffeq.odeint(rate, start, t, **settings)
     except AssertionError as error:  # how torchdiffeq says that a step became too small or a state infinite
         raise ComputationError(
             f"integrate: {solver.method} found no step with an error below atol = {solver.atol} voxels ({error}); "
@@ -238,9 +240,38 @@ def _moved(state: Tensor, slopes: Sequence[Tensor], weights: Sequence[float], h:
     return state
 
 
-def preload() -> None:
-    """Import torchdiffeq, which takes half a second, in a thread of its own beside what comes first."""
-    threading.Thread(target=import_module, args=("torchdiffeq",), daemon=True).start()
+def _torchdiffeq() -> Any:
+    """Import torchdiffeq, but not scipy.integrate with it: half a second, for one solver that is not used here.
+
+    While torchdiffeq is imported a stand-in takes the place of that module. It gives out a `solve_ivp` that imports
+    the real one when it is called, so that torchdiffeq's ``scipy_solver`` works for everybody else.
+    """
+    if "torchdiffeq" in sys.modules or _UNUSED in sys.modules:
+        return import_module("torchdiffeq")
+    sys.modules[_UNUSED] = _StandIn(_UNUSED)
+    try:
+        return import_module("torchdiffeq")
+    finally:
+        if isinstance(sys.modules.get(_UNUSED), _StandIn):
+            del sys.modules[_UNUSED]
+
+
+_UNUSED = "scipy.integrate"
+
+
+class _StandIn(ModuleType):
+    """A module that is imported when something else than `solve_ivp` is asked of it, as another thread may do."""
+
+    @staticmethod
+    def solve_ivp(*arguments: Any, **options: Any) -> Any:
+        """Call the function of the real module."""
+        return import_module(_UNUSED).solve_ivp(*arguments, **options)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        sys.modules.pop(_UNUSED, None)
+        return getattr(import_module(_UNUSED), name)
 
 
 def _equal_steps(steps: int) -> Callable[[Rate, Tensor, Tensor], Tensor]:

@@ -23,7 +23,6 @@ _FLOOR_ROUNDS, _ROUNDS = 100, 1000
 _WIDEN = {2: F.max_pool2d, 3: F.max_pool3d}
 
 
-@torch.no_grad()
 def largest_share(accept: Callable[[Tensor], Tensor], like: Tensor, *, halvings: int, refine: bool = False) -> Tensor:
     """Return the largest share t of a move that is accepted, for each item ``(B,)``: 1, or found by halving.
 
@@ -38,7 +37,8 @@ def largest_share(accept: Callable[[Tensor], Tensor], like: Tensor, *, halvings:
         ``(B,)``: t = 1, 1/2, .., 2^−halvings, a multiple of the last with ``refine``; 0 where nothing was accepted.
 
     Notes:
-        At most ``halvings`` + 1 calls. What is not finite is never accepted, if ``accept`` compares with ≥ or >.
+        At most ``halvings`` + 1 calls. What is not finite is never accepted, if ``accept`` compares with ≥ or >. The
+        share counts as constant for gradients.
     """
     share = torch.zeros_like(like)
     for halving in range(halvings + 1):
@@ -98,9 +98,9 @@ def repair_folds(u: Tensor, grid: Grid, floor: float = 0.0) -> Tensor:
             return u
         if step == 0 and not bool(u.isfinite().all()):
             raise ComputationError("the map is not finite; check the images for extreme values, or take smaller steps")
-        wider = _WIDEN[grid.dim](folded.to(u.dtype), 5, stride=1, padding=2)
+        wider = _WIDEN[grid.dim](folded.to(u.dtype), 3, stride=1, padding=1)
         share = torch.maximum(share, wider)
-        fading = neighbour_mean(neighbour_mean(share))
+        fading = neighbour_mean(share)
         u = keep_faces(torch.lerp(u, neighbour_mean(u), fading.expand_as(u)), u, grid)
     raise ComputationError(
         f"the map still folds after {_ROUNDS} rounds of smoothing: it varies too much for this grid; take smoother "

@@ -163,7 +163,7 @@ _NODES_PER_THREAD = 2**16
 
 
 @contextmanager
-def threads_worth(fields: int, grid: Grid) -> Iterator[None]:
+def limit_threads(fields: int, grid: Grid) -> Iterator[None]:
     """Use no more of torch's threads than so many fields are worth: on a shared machine they wait for each other."""
     before = torch.get_num_threads()
     torch.set_num_threads(max(1, min(before, fields * math.prod(grid.shape) // _NODES_PER_THREAD)))

@@ -1,4 +1,4 @@
-"""An image in physical space: values on a grid, and where that grid lies in the world (ITK's LPS convention)."""
+"""An image in physical space: values on a grid, and where that grid is in the world (ITK's LPS convention)."""
 
 import math
 from dataclasses import dataclass, replace
@@ -48,9 +48,9 @@ class Image:
         if len(self.origin) != dim or len(self.direction) != dim or {len(r) for r in self.direction} != {dim}:
             raise InputError(f"{self.name}: origin and direction must have {dim} axes like the image")
         if not all(map(math.isfinite, self.origin)):
-            raise InputError(f"{self.name}: its origin {self.origin} is not finite; mend the file's header")
+            raise InputError(f"{self.name}: its origin {self.origin} is not finite; correct the header of the file")
         if not abs(float(torch.linalg.det(torch.tensor(self.direction, dtype=torch.float64)))) > 1e-6:
-            raise InputError(f"{self.name}: its direction matrix is singular; mend the file's header")
+            raise InputError(f"{self.name}: its direction matrix is singular; correct the header of the file")
 
     def to_world(self, points: Tensor) -> Tensor:
         """Map grid points ``(B, D, *T)`` (array order, units of spacing, node 0 at 0) to world points (x, y, z)."""
@@ -80,7 +80,7 @@ def resample(
 
     Args:
         moving: the image to sample.
-        fixed: the image whose grid is wanted.
+        fixed: the image whose grid the result has.
         u: displacement ``(1, D, *S)`` on the fixed grid (array order, units of spacing) of φ = id + u; zero when
             None.
         mode: ``linear`` or ``nearest``.
@@ -188,12 +188,12 @@ def require_same_place(image: Image, other: Image, *, atol: float = 1e-3) -> Non
 
 
 def overlap(fixed: Image, moving: Image, *, samples: int = 32) -> float:
-    """Return the share of the fixed grid that lies inside the moving image, 0 (apart) to 1 (covered).
+    """Return the share of the fixed grid that is inside the moving image, 0 (apart) to 1 (covered).
 
     Args:
-        fixed: the image whose grid is looked at.
-        moving: the image it should lie in; both are taken in their physical place.
-        samples: nodes looked at along each axis, the first and the last among them.
+        fixed: the image whose grid is compared.
+        moving: the image it should be in; both are taken in their physical place.
+        samples: positions compared along each axis, the first and the last node among them.
 
     Raises:
         InputError: one image is 2D and the other 3D.

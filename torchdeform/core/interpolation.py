@@ -1,4 +1,4 @@
-"""Interpolation at scattered points: nearest, linear, cubic B-spline as ITK's resampler does it; labels by a vote."""
+"""Interpolation at scattered points: nearest, linear, cubic B-spline as in ITK's resampler; and one for labels."""
 
 import math
 from collections.abc import Callable
@@ -23,17 +23,17 @@ _SPLINE: _Kernel = (
     (1 / 6, 0, 0, 0),
 )
 
-# A Gaussian of half a voxel takes this share to either neighbour; then the same for it and linear interpolation.
-_ASIDE = 1 / (2 + math.exp(2))
-_VOTES: _Kernel = (
-    (0, 0, -_ASIDE, _ASIDE),
-    (0, 0, 3 * _ASIDE - 1, 1 - 2 * _ASIDE),
-    (0, 0, 1 - 3 * _ASIDE, _ASIDE),
-    (0, 0, _ASIDE, 0),
+# A Gaussian of half a voxel gives this share to either neighbour; below it is combined with linear interpolation.
+_SIDE = 1 / (2 + math.exp(2))
+_LABEL_KERNEL: _Kernel = (
+    (0, 0, -_SIDE, _SIDE),
+    (0, 0, 3 * _SIDE - 1, 1 - 2 * _SIDE),
+    (0, 0, 1 - 3 * _SIDE, _SIDE),
+    (0, 0, _SIDE, 0),
 )
 
-# Nodes that vote lie at most this far from the nearest one, and points that are voted on at once.
-_ELECTORATE = 2
+# Nodes whose labels count are at most this far from the nearest one; and the number of points done at once.
+_RADIUS = 2
 _POINTS_AT_ONCE = 2**16
 
 _MAX_POOL = {2: F.max_pool2d, 3: F.max_pool3d}
@@ -90,57 +90,58 @@ def _label(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
     if not bool(image.isfinite().all()):
         raise InputError("labels must be finite numbers, but some are NaN or infinite; replace them first, say by 0")
     nearest = _nearest(image, grid, None)
-    disputed = _nearest(_disputed(image.detach()), grid, None)
+    near_border = _nearest(_near_border(image.detach()), grid, None)
 
     def at(points: Tensor) -> Tensor:
         index = _index(points.detach(), grid)
-        found, unsure = nearest(points), disputed(points)
+        found, unsure = nearest(points), near_border(points)
         for channel, values in enumerate(image.detach().flatten(2)[0]):
             there = unsure[:, channel].nonzero(as_tuple=True)
             for some in zip(*(part.split(_POINTS_AT_ONCE) for part in there), strict=True):
                 near = [x[some].clamp(0, n - 1) for x, n in zip(index, grid.shape, strict=True)]
-                found[:, channel][some] = _elected(*_voters(values, near, grid))
+                found[:, channel][some] = _heaviest_label(*_weighted_labels(values, near, grid))
         return _fill(found, index, grid, outside)
 
     return at
 
 
-def _disputed(image: Tensor) -> Tensor:
-    """Return where not all nodes that may vote have one label ``(1, C, *S)``, bool."""
+def _near_border(image: Tensor) -> Tensor:
+    """Return where not all nodes whose labels count have the same one ``(1, C, *S)``, bool."""
     low, high = -image, image
     for axis in range(2, image.dim()):
-        reach = [_ELECTORATE if a == axis else 0 for a in range(2, image.dim())]
-        low, high = (
-            _MAX_POOL[len(reach)](part, [2 * r + 1 for r in reach], 1, reach).view(image.shape) for part in (low, high)
-        )
+        radius = [_RADIUS if a == axis else 0 for a in range(2, image.dim())]
+        window = [2 * r + 1 for r in radius]
+        low, high = (_MAX_POOL[len(radius)](part, window, 1, radius).view(image.shape) for part in (low, high))
     return low + high != 0
 
 
-def _voters(values: Tensor, index: list[Tensor], grid: Grid) -> tuple[Tensor, Tensor]:
+def _weighted_labels(values: Tensor, index: list[Tensor], grid: Grid) -> tuple[Tensor, Tensor]:
     """Return the labels of the nodes around each position, given in voxels, and their weights, ``(4^D, N)`` each."""
     nodes = torch.zeros_like(index[0], dtype=torch.long).unsqueeze(0)
     weights = torch.ones_like(nodes, dtype=torch.float32)
     for x, n, stride in zip(index, grid.shape, _strides(grid), strict=True):
-        near = _support(x, n, stride, torch.float32, _VOTES)
+        near = _support(x, n, stride, torch.float32, _LABEL_KERNEL)
         nodes = torch.cat([nodes + node for node, _ in near])
         weights = torch.cat([weights * weight for _, weight in near])
     return values[nodes], weights
 
 
-def _elected(labels: Tensor, weights: Tensor) -> Tensor:
-    """Return for each column the label with the largest sum of weights: the heaviest node's first, then the rest's."""
-    winner, best = labels[0].clone(), torch.zeros_like(weights[0])
-    still = torch.arange(len(winner), device=winner.device)
-    while len(still):
-        heaviest = weights.argmax(0, keepdim=True)
-        candidate = labels.gather(0, heaviest)
-        votes = weights * (labels == candidate)
-        total, weights = votes.sum(0), weights - votes
-        better = total > best[still]
-        winner[still[better]], best[still[better]] = candidate[0, better], total[better]
-        going = weights.sum(0) > best[still]
-        still, labels, weights = still[going], labels[:, going], weights[:, going]
-    return winner
+def _heaviest_label(labels: Tensor, weights: Tensor) -> Tensor:
+    """Return for each column the label with the largest sum of weights.
+
+    Label by label, that of the heaviest node first, as long as what is left could be heavier than the best so far.
+    """
+    found, best = labels[0].clone(), torch.zeros_like(weights[0])
+    open_ = torch.arange(len(found), device=found.device)
+    while len(open_):
+        candidate = labels.gather(0, weights.argmax(0, keepdim=True))
+        own = weights * (labels == candidate)
+        total, weights = own.sum(0), weights - own
+        better = total > best[open_]
+        found[open_[better]], best[open_[better]] = candidate[0, better], total[better]
+        undecided = weights.sum(0) > best[open_]
+        open_, labels, weights = open_[undecided], labels[:, undecided], weights[:, undecided]
+    return found
 
 
 def _cubic(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
@@ -174,7 +175,7 @@ _MODES: dict[str, Callable[[Tensor, Grid, float | None], Sampler]] = {
 }
 MODES = tuple(_MODES)
 
-# The mode that labels are carried with where nobody asks for another, and those that copy values.
+# The default mode for labels, and the modes that copy values.
 LABEL_MODE = "label"
 COPYING = ("nearest", LABEL_MODE)
 

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 
-# Rows of a block: fewer entries of it are 0 the fewer rows it has, but small products do not pay. Two fields of 4096²
-# on half as many nodes an axis: 0.1 s, against 1.4 s when entries are taken one by one.
+# Rows of a block: with fewer rows fewer of its entries are 0, but small products are slow. Two fields of 4096² on half
+# as many nodes an axis: 0.1 s, against 1.4 s when entries are taken one by one.
 _ROWS = {"cpu": 32, "cuda": 256}
 
 # Matrices of no more entries than this are one block: a call costs more than the products with their zeros.
 _SMALL = 2**13
 
-# Standard deviations to which a Gaussian reaches.
+# A Gaussian is cut off at so many standard deviations.
 _REACH = 3
 
 
@@ -92,16 +92,38 @@ def interpolation(coarse: int, fine: int, like: Tensor) -> Banded | None:
 
     Args:
         coarse: number of nodes that are given.
-        fine: number of nodes wanted.
-        like: a tensor with the dtype and device wanted.
+        fine: number of nodes of the result.
+        like: a tensor with the dtype and device of the result.
     """
     return None if coarse == fine else banded(*_linear(coarse, fine), (fine, coarse), like)
 
 
-def gathering(fine: int, coarse: int, like: Tensor) -> Banded | None:
+def interpolation_transpose(fine: int, coarse: int, like: Tensor) -> Banded | None:
     """Return the transpose of `interpolation`, divided by the number of fine intervals to a coarse one."""
     rows, columns, values = _linear(coarse, fine)
     return None if coarse == fine else banded(columns, rows, values * ((coarse - 1) / (fine - 1)), (coarse, fine), like)
+
+
+def hat_average(field: Tensor, coarse: Grid) -> Tensor:
+    """Return the mean of a field ``(B, C, *S)`` around each node of a coarser grid, weighted by its hat function.
+
+    Args:
+        field: on a grid of the same box.
+        coarse: the grid of the result.
+    """
+    counts = zip(field.shape[2:], coarse.shape, strict=True)
+    return multiply(field, [_hats(many, few, field.dtype, field.device) for many, few in counts])
+
+
+@lru_cache(maxsize=64)
+def _hats(fine: int, coarse: int, dtype: torch.dtype, device: torch.device) -> Banded | None:
+    """Return the transpose of linear interpolation, every row divided by its sum."""
+    if coarse == fine:
+        return None
+    with torch.inference_mode(False), torch.no_grad():
+        columns, rows, values = _linear(coarse, fine)
+        sums = values.new_zeros(coarse).index_add_(0, rows, values)
+        return banded(rows, columns, values / sums[rows], (coarse, fine), torch.empty(0, dtype=dtype, device=device))
 
 
 def restriction(fine: int, coarse: int, blur: float, like: Tensor) -> Banded | None:
@@ -109,9 +131,9 @@ def restriction(fine: int, coarse: int, blur: float, like: Tensor) -> Banded | N
 
     Args:
         fine: number of nodes that are given.
-        coarse: number of nodes wanted.
+        coarse: number of nodes of the result.
         blur: standard deviation in voxels of the coarse axis.
-        like: a tensor with the dtype and device wanted.
+        like: a tensor with the dtype and device of the result.
     """
     if coarse == fine:
         return None
@@ -125,10 +147,10 @@ def restriction(fine: int, coarse: int, blur: float, like: Tensor) -> Banded | N
     return banded(*flat, (coarse, fine), like)
 
 
-def _linear(given: int, wanted: int) -> tuple[Tensor, Tensor, Tensor]:
+def _linear(given: int, asked: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return rows, columns and values of linear interpolation from so many nodes of an interval to others."""
-    rows = torch.arange(wanted)
-    place = rows.double() * ((given - 1) / (wanted - 1))
+    rows = torch.arange(asked)
+    place = rows.double() * ((given - 1) / (asked - 1))
     left = place.long().clamp(max=given - 2)
     share = place - left
     return rows.repeat(2), torch.cat([left, left + 1]), torch.cat([1 - share, share])
@@ -142,7 +164,7 @@ def banded(rows: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]
         columns: whole numbers, near one another in rows that are.
         values: entries.
         shape: rows and columns of the matrix.
-        like: a tensor with the dtype and device wanted.
+        like: a tensor with the dtype and device of the result.
     """
     blocks, size = [], shape[0] if math.prod(shape) <= _SMALL else _ROWS.get(like.device.type, 256)
     for start in range(0, shape[0], size):
@@ -174,7 +196,7 @@ def box_sum(x: Tensor, window: int, stride: int = 1) -> Tensor:
     return x
 
 
-def box_spread(y: Tensor, window: int, stride: int, shape: tuple[int, ...]) -> Tensor:
+def box_sum_transpose(y: Tensor, window: int, stride: int, shape: tuple[int, ...]) -> Tensor:
     """Return at each node Σ y over the windows that hold it: the transpose of `box_sum` on ``shape``.
 
     Args:
@@ -224,7 +246,7 @@ class Transfer:
     Args:
         fine: grid of the images.
         coarse: grid of the map, no finer along any axis.
-        like: a tensor with the dtype and device wanted.
+        like: a tensor with the dtype and device of the result.
     """
 
     fine: Grid
@@ -248,7 +270,7 @@ class Transfer:
 
     @cached_property
     def _downs(self) -> list[Banded | None]:
-        return [gathering(many, few, self.like) for many, few in self._counts]
+        return [interpolation_transpose(many, few, self.like) for many, few in self._counts]
 
     @property
     def _counts(self) -> list[tuple[int, int]]:
@@ -273,29 +295,29 @@ def pyramid_grids(grid: Grid, levels: int) -> list[Grid]:
 
     Args:
         grid: the finest grid.
-        levels: number of levels wanted.
+        levels: number of levels at most.
 
     Returns:
-        Grids of the same box. Each level aims at twice the voxel size of the next, starting from the finest spacing, so
-        thick slices are thinned out last. Levels with fewer than 16 nodes along every axis are left out.
+        Grids of the same box. Each level has about twice the spacing of the next, counted from the smallest spacing, so
+        thick slices are coarsened last. Levels with fewer than 16 nodes along every axis are left out.
     """
     grids = [grid]
     for level in range(1, levels):
-        coarser = thinned(grid, 2**level)
+        coarser = coarsened(grid, 2**level)
         if coarser.shape != grids[0].shape and max(coarser.shape) >= _MIN_LONGEST:
             grids.insert(0, coarser)
     return grids
 
 
-def thinned(grid: Grid, times: float) -> Grid:
-    """Return the grid of the same box whose voxels are about so many times as wide as the narrowest of ``grid``."""
-    return with_voxels(grid, min(grid.spacing) * times)
+def coarsened(grid: Grid, factor: float) -> Grid:
+    """Return the grid of the same box whose spacing is about ``factor`` times the smallest one of ``grid``."""
+    return with_spacing(grid, min(grid.spacing) * factor)
 
 
-def with_voxels(grid: Grid, width: float) -> Grid:
-    """Return the grid of the same box with voxels of about this width, at least 8 nodes an axis where there are."""
+def with_spacing(grid: Grid, spacing: float) -> Grid:
+    """Return the grid of the same box with about this spacing; larger ones stay, and so do 8 nodes of an axis."""
     shape = tuple(
-        n if h >= width else min(n, max(MIN_NODES, round(side / width) + 1))
+        n if h >= spacing else min(n, max(MIN_NODES, round(side / spacing) + 1))
         for n, h, side in zip(grid.shape, grid.spacing, grid.extent, strict=True)
     )
     if shape == grid.shape:
@@ -309,7 +331,7 @@ def restrict(image: Tensor, grid: Grid, coarse: Grid) -> Tensor:
     Args:
         image: ``(B, C, *S)`` on ``grid``.
         grid: its grid.
-        coarse: the grid wanted.
+        coarse: the grid of the result.
     """
     counts = zip(grid.shape, coarse.shape, strict=True)
     return multiply(image, [restriction(many, few, _BLUR, image) for many, few in counts])
@@ -320,7 +342,7 @@ def prolong(u: Tensor, grid: Grid) -> Tensor:
 
     Args:
         u: ``(B, D, *S)`` in units of spacing.
-        grid: the grid wanted.
+        grid: the grid of the result.
     """
     if tuple(u.shape[2:]) == grid.shape:
         return u

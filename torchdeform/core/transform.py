@@ -78,13 +78,13 @@ class Affine:
         return lambda points: torch.linalg.det(self.matrix).to(points) * torch.ones_like(points[:, :1])
 
     def to(self, device: torch.device | str) -> "Affine":
-        """Return the same map; where its few numbers lie does not matter, so they stay."""
+        """Return the same map; its few numbers may stay where they are."""
         del device
         return self
 
 
 def place_of(image: Image) -> Image:
-    """Return where an image lies, without its pixels: zeros that take no memory."""
+    """Return an image with the same grid and place, but zeros that take no memory as pixels."""
     nothing = torch.zeros(()).expand(1, 1, *image.grid.shape)
     return replace(image, data=nothing)
 
@@ -286,7 +286,7 @@ class Transform:
 
         Args:
             moving: image in the moving space, any grid and any number of channels.
-            reference: whose grid the result is wanted on; `reference` of this transform when None.
+            reference: grid of the result; `reference` of this transform when None.
             mode: ``nearest``, ``linear``, ``cubic`` or ``label``; see `torchdeform.core.interpolation.interpolator`.
             outside: value where φ(x) is outside the moving image (ITK's resampler uses 0); None continues its edge.
 
@@ -294,7 +294,7 @@ class Transform:
             An image on the reference grid, with the moving image's type.
 
         Raises:
-            InputError: mode, dimensions, no reference known, or images that lie elsewhere than this transform's.
+            InputError: mode, dimensions, no reference known, or images in another place than those of this transform.
 
         Notes:
             One interpolation only, whatever the number of stages; coordinates in float64. Differentiable in the moving
@@ -307,18 +307,18 @@ class Transform:
         return replace(place, data=pixels, name=moving.name, pixel_type=moving.pixel_type)
 
     def labels(self, moving: Image, reference: Image | None = None, *, mode: str = LABEL_MODE) -> Image:
-        """Return the labels of the moving image in the fixed space: `image` by a vote around each point, 0 outside.
+        """Return the labels of the moving image in the fixed space: by `image` in mode ``label``, 0 outside.
 
         Args:
             moving: whole numbers in the moving space.
             reference: as in `image`.
-            mode: ``label``, whose borders stay smooth, or ``nearest``, which keeps the thinnest parts.
+            mode: ``label``, with smooth borders, or ``nearest``, which keeps the thinnest parts.
 
         Raises:
             InputError: as `image`; labels that are not finite.
 
         Notes:
-            Values are copied, never computed, so integers stay integers; labels above 2²⁴ want float64 ``data``.
+            Values are copied, never computed, so integers stay integers; labels above 2²⁴ need float64 ``data``.
         """
         return self.image(moving, reference, mode=mode)
 
@@ -326,7 +326,7 @@ class Transform:
         """Return the whole chain as one displacement on a grid, u = to_grid(φ(to_world(x))) − x.
 
         Args:
-            reference: whose grid it is wanted on (fixed space); `reference` of this transform when None.
+            reference: its grid is that of the result (fixed space); `reference` of this transform when None.
 
         Returns:
             A `Displacement`, float64: its points go from fixed to moving like those of this transform.
@@ -399,7 +399,7 @@ class Transform:
             other: a transform whose fixed space is this one's moving space.
 
         Raises:
-            InputError: dimensions, or spaces that lie apart, as they do when the order is wrong.
+            InputError: dimensions, or spaces without overlap, as when the order is wrong.
         """
         if self.moving is not None and other.fixed is not None and self.dim == other.dim:
             _require_overlap(

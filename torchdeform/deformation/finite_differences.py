@@ -1,6 +1,6 @@
 """Least squares on finite differences: rows like the divergence and the curl of a field that is 0 on the boundary.
 
-The rows are Σ C_ka ∂_a v_k and the components of curl v, at all nodes and by the kernels of `stencil`, one-sided at the
+The rows are Σ C_ka ∂_a v_k and the components of curl v at all nodes, by the kernels of `derivatives`, one-sided at the
 boundary. With C = I the first is the divergence, with the cofactors of ∇φ the linearised determinant. Their squares are
 summed with trapezoidal weights. So a field is found again from its own differences to rounding, which elements allow
 only up to the square of the spacing.
@@ -23,6 +23,7 @@ from torchdeform.core.derivatives import (
     map_jacobian,
 )
 from torchdeform.core.grid import Grid
+from torchdeform.solvers.cg import dots
 from torchdeform.solvers.sine_cosine import Kind, separable_transform
 
 
@@ -136,11 +137,6 @@ def _symbol(grid: Grid, axis: int, order: int, like: Tensor) -> Tensor:
     symbol = symbol / grid.spacing[axis]
     symbol[[0, -1]] = 1.0
     return symbol.to(like)
-
-
-def dots(a: Tensor, b: Tensor) -> Tensor:
-    """Return a·b for each item ``(B,)``, one by one: a batch may be summed in another order than an item alone."""
-    return torch.stack([torch.dot(i.reshape(-1), j.reshape(-1)) for i, j in zip(a, b, strict=True)])
 
 
 def clear_boundary(field: Tensor, grid: Grid) -> Tensor:

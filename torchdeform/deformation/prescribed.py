@@ -11,13 +11,13 @@ from torchdeform.core.derivatives import CURL_PAIRS, KERNELS, cofactors, jacobia
 from torchdeform.core.diagnostics import smallest_determinant
 from torchdeform.core.fold_free import largest_share
 from torchdeform.core.grid import Grid, per_item
-from torchdeform.deformation.finite_differences import Differences, dots
+from torchdeform.deformation.finite_differences import Differences
 from torchdeform.deformation.monitors import require_positive
 from torchdeform.errors import InputError, require_choice
 from torchdeform.fem.boundary import fixed_unknowns
 from torchdeform.fem.div_curl import solve_div_curl
 from torchdeform.solvers.base import Solution, Status
-from torchdeform.solvers.cg import DEFAULT_RTOL, conjugate_gradient
+from torchdeform.solvers.cg import DEFAULT_RTOL, conjugate_gradient, dots
 
 # ‖residual‖ ≤ rtol ‖(f − 1, curl)‖ is asked for when nothing else is said.
 _RTOL = {torch.float32: 1e-5, torch.float64: 1e-12}

@@ -13,7 +13,6 @@ from torchdeform.core.diagnostics import smallest_determinant
 from torchdeform.core.flow import OdeSolver, integrate_points
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import sample
-from torchdeform.deformation.finite_differences import dots
 from torchdeform.deformation.monitors import mean_value, smooth
 from torchdeform.deformation.versions import grid_from_initial_monitor
 from torchdeform.errors import ComputationError, InputError
@@ -22,6 +21,7 @@ from torchdeform.fem.solver import SolverSettings, solver_of
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
 from torchdeform.solvers.base import Solution, Status
+from torchdeform.solvers.cg import dots
 
 # Next to what must not move no velocity has both the divergence and the curl that are asked for: volumes come first.
 _AROUND_RIGID = Weights(div=10.0, curl=1.0)

@@ -1,6 +1,7 @@
 """The assembled system as torch sparse matrices, for small grids, other solvers and tests."""
 
 import math
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -9,6 +10,9 @@ from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.fem.elements import components, element_matrices
 from torchdeform.fem.form import Form
+
+# The neighbours of a node, itself among them, in the order of their numbers.
+_OFFSETS: dict[int, list[tuple[int, ...]]] = {dim: list(product((-1, 0, 1), repeat=dim)) for dim in (2, 3)}
 
 
 def assemble(form: Form, grid: Grid, device: torch.device | str = "cpu") -> Tensor:
@@ -27,28 +31,49 @@ def assemble(form: Form, grid: Grid, device: torch.device | str = "cpu") -> Tens
         InputError: coefficients that vary over the batch.
 
     Notes:
-        Takes C²·4^D entries per element before they are added up: 576 in 3D, some 13 kB. Beyond 64³ take
-        `operator.apply_form`. A product with the matrix runs 25 times faster as CSR, see `cg.to_csr`.
+        A node is coupled to its 3^D − 1 neighbours, so the entries of all elements are added up neighbour by neighbour
+        and stand in the order of rows and columns: nothing is sorted. Takes C²·3^D entries a node, 243 in 3D or some
+        10 kB with their indices. A product with the matrix runs 25 times faster as CSR, see `cg.to_csr`.
     """
-    matrices = element_matrices(form, grid, device)
+    values = _by_neighbours(form, grid, device)
+    count, nodes = values.shape[0], math.prod(grid.shape)
+    shift, inside = _neighbours(grid, values.device)
+    # Rows (component, node), and in each of them columns (component, neighbour).
+    known = inside.view(1, nodes, 1, -1).expand(count, -1, count, -1)
+    number = torch.arange(count, device=values.device)
+    node = torch.arange(nodes, device=values.device)
+    row = (number.view(-1, 1, 1, 1) * nodes + node.view(1, -1, 1, 1)).expand_as(known)[known]
+    column = (number.view(1, 1, -1, 1) * nodes + node.view(1, -1, 1, 1) + shift).expand_as(known)[known]
+    entries = values.flatten(3).permute(0, 3, 1, 2)[known]
+    size = (count * nodes, count * nodes)
+    return torch.sparse_coo_tensor(torch.stack([row, column]), entries, size, is_coalesced=True, check_invariants=False)
+
+
+def _by_neighbours(form: Form, grid: Grid, device: torch.device | str) -> Tensor:
+    """Return the entries of each node with its neighbours, ``(C, C, 3^D, *S)``: row, column, neighbour, node."""
+    matrices, count = element_matrices(form, grid, device), components(form)
     if matrices.shape[0] != 1:
         raise InputError(f"assemble: one matrix has one set of coefficients, got a batch of {matrices.shape[0]}")
-    elements = [n - 1 for n in grid.shape]
-    unknowns = element_unknowns(grid, components(form)).to(matrices.device)
-    size = unknowns.shape[0]
-    index = [unknowns.unsqueeze(d).expand(size, size, -1).flatten() for d in (1, 0)]
-    values = matrices[0].expand(size, size, *elements).flatten()
-    total = components(form) * math.prod(grid.shape)
-    return torch.sparse_coo_tensor(torch.stack(index), values, (total, total), check_invariants=False).coalesce()
+    elements, corners = [n - 1 for n in grid.shape], list(product((0, 1), repeat=grid.dim))
+    blocks = matrices[0].expand(*matrices.shape[1:3], *elements).unflatten(1, (count, -1)).unflatten(0, (count, -1))
+    values = matrices.new_zeros(count, count, 3**grid.dim, *grid.shape)
+    for (i, start), (j, end) in product(enumerate(corners), repeat=2):
+        neighbour = _OFFSETS[grid.dim].index(tuple(b - a for a, b in zip(start, end, strict=True)))
+        place = tuple(slice(a, a + e) for a, e in zip(start, elements, strict=True))
+        values[(slice(None), slice(None), neighbour, *place)] += blocks[:, i, :, j]
+    return values
 
 
-def element_unknowns(grid: Grid, count: int = 1) -> Tensor:
-    """Return the global number of each unknown k·2^D + corner of each element, ``(count·2^D, elements)``."""
-    nodes = torch.arange(math.prod(grid.shape)).view(grid.shape)
-    for axis in range(grid.dim):
-        nodes = nodes.unfold(axis, 2, 1)
-    corners = nodes.flatten(grid.dim).flatten(0, grid.dim - 1).T
-    return torch.cat([corners + k * math.prod(grid.shape) for k in range(count)])
+def _neighbours(grid: Grid, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return by how much the number of each neighbour differs ``(3^D,)``, and where it exists ``(N, 3^D)``."""
+    strides = [math.prod(grid.shape[axis + 1 :]) for axis in range(grid.dim)]
+    shift = [sum(o * s for o, s in zip(offset, strides, strict=True)) for offset in _OFFSETS[grid.dim]]
+    inside = torch.ones(*grid.shape, len(shift), dtype=torch.bool, device=device)
+    for k, offset in enumerate(_OFFSETS[grid.dim]):
+        for axis, step in enumerate(offset):
+            if step:
+                inside[..., k].select(axis, 0 if step < 0 else -1).fill_(False)
+    return torch.tensor(shift, device=device), inside.view(-1, len(shift))
 
 
 def constrain_matrix(matrix: Tensor, fixed: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torchdeform.fem.boundary import Boundary, normal_is_given, outward_flux
 from torchdeform.fem.fast_transform import solve_poisson
 from torchdeform.fem.form import gradient_form
 from torchdeform.fem.operator import assemble_load
-from torchdeform.fem.solver import Method, SolverSettings, solver_of
+from torchdeform.fem.solver import SolverSettings, solver_of
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
 from torchdeform.solvers.base import Solution, Status
@@ -45,7 +45,7 @@ def solve_div_curl(
     *,
     boundary_values: Tensor | None = None,
     weights: Weights = _UNIT,
-    solver: SolverSettings | Method = "auto",
+    solver: SolverSettings | str = "auto",
     theta: bool = False,
 ) -> DivCurlSolution:
     """Return v that minimises ∫ w_div (div v − α)² + w_curl |curl v − β|² + w_zero |v|² over Q1 fields.

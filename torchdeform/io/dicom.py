@@ -187,7 +187,7 @@ def _steps(series: Sequence[Slice]) -> NDArray[np.float64]:
 
 
 def _has_frames(series: Sequence[Slice]) -> bool:
-    """Return whether positions repeat on purpose: at different moments, or in half again as many files as positions."""
+    """Return whether positions repeat on purpose: at different times, or in 1.5 times as many files as positions."""
     again = [(one, two) for one, two in pairwise(_sorted(series)) if two.height - one.height <= _SAME]
     return any(one.moment != two.moment for one, two in again) or len(series) >= 1.5 * (len(_steps(series)) + 1)
 
@@ -239,10 +239,10 @@ def _require_regular(slices: Sequence[Slice], name: str) -> float:
             uneven = f"{gap:.3g} mm {between}, {step:.3g} mm elsewhere"
             raise InputError(f"{name}: its slices are unevenly spaced ({uneven}); resample it to even slices first")
     path = slices[-1].position - slices[0].position
-    aside = np.linalg.norm(slices[0].axes[:, :2].T @ path) / len(pairs)
-    if aside > _SHEAR * step:
+    shift = np.linalg.norm(slices[0].axes[:, :2].T @ path) / len(pairs)
+    if shift > _SHEAR * step:
         raise InputError(
-            f"{name}: its slices are shifted sideways by {aside:.2g} mm each (a tilted gantry), so its axes are not at "
+            f"{name}: its slices are shifted sideways by {shift:.2g} mm each (a tilted gantry), so its axes are not at "
             "right angles; reslice it onto a rectangular grid first"
         )
     return float(slices[-1].height - slices[0].height) / len(pairs)

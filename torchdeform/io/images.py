@@ -168,11 +168,11 @@ def write_image(image: Image, path: str | os.PathLike[str]) -> None:
     """
     file = Path(path)
     pixels, paged = _stored(image, file), suffix(file) in (".tif", ".tiff") and image.grid.dim == 3
-    with atomic_folder(file.parent) as folder:
-        if paged and pixels.dtype.name in _PAGED:
+    if paged and pixels.dtype.name in _PAGED:
+        with atomic_folder(file.parent) as folder:
             write_tiff(pixels, image.grid.spacing, folder / file.name)
-        else:
-            itk.save(itk.from_values(pixels, image), folder / file.name)
+    else:
+        itk.save(itk.from_values(pixels, image), file)
 
 
 def _stored(image: Image, path: Path) -> NDArray[np.generic]:

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchdeform.core.grid import Grid, slabs
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.io.files import native_stderr
+from torchdeform.io.files import atomic_folder, native_stderr
 from torchdeform.io.validation import DAMAGED, NOT_SQUARE
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def _execute(reader: "sitk.ImageFileReader") -> "sitk.Image | RuntimeError":
 
 
 def quietly(work: Callable[[], _Result]) -> "_Result | RuntimeError":
-    """Return what ``work`` returns, or the error that it raises. What ITK prints meanwhile is dropped."""
+    """Return what ``work`` returns, or the error that it raises. What ITK prints is dropped."""
     with native_stderr(), _no_warnings():
         try:
             return work()
@@ -82,12 +82,16 @@ def quietly(work: Callable[[], _Result]) -> "_Result | RuntimeError":
 
 
 def save(image: "sitk.Image", path: Path) -> None:
-    """Write a file with SimpleITK, compressed if the format can; `InputError` if it cannot be written."""
+    """Write a file with SimpleITK, complete or not at all, compressed if the format can.
+
+    Raises:
+        InputError: the format cannot hold the image, or the folder cannot be written.
+    """
     import SimpleITK as sitk
 
     try:
-        with native_stderr(), _no_warnings():
-            sitk.WriteImage(image, str(path), useCompression=True)
+        with atomic_folder(path.parent) as folder, native_stderr(), _no_warnings():
+            sitk.WriteImage(image, str(folder / path.name), useCompression=True)
     except RuntimeError as error:
         raise InputError(f"{path.name} cannot be written: {reason(error)}; choose another format or folder") from error
 

@@ -10,7 +10,7 @@ import torch
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import itk
-from torchdeform.io.files import atomic_folder, suffix
+from torchdeform.io.files import suffix
 from torchdeform.io.images import FORMATS, read_image, write_image
 
 # Types whose values float32, in which images are read, cannot all represent.
@@ -51,12 +51,11 @@ def write_labels(image: Image, path: str | os.PathLike[str]) -> None:
     Raises:
         InputError: a format that cannot hold that type, or a folder that cannot be written.
     """
-    file, ending = Path(path), suffix(Path(path))
-    if ending not in _VOLUMES:
-        if ending in FORMATS and image.pixel_type not in FORMATS[ending].types:
-            raise InputError(f"{path}: {ending} files cannot hold labels of type {image.pixel_type}; use .nii.gz")
-        return write_image(image, file)
-    values = image.data[0].detach().cpu().numpy().astype(image.pixel_type)
-    with atomic_folder(file.parent) as folder:
-        itk.save(itk.from_values(values, image), folder / file.name)
-    return None
+    ending = suffix(Path(path))
+    if ending in _VOLUMES:
+        values = image.data[0].detach().cpu().numpy().astype(image.pixel_type)
+        itk.save(itk.from_values(values, image), Path(path))
+    elif ending in FORMATS and image.pixel_type not in FORMATS[ending].types:
+        raise InputError(f"{path}: {ending} files cannot hold labels of type {image.pixel_type}; use .nii.gz")
+    else:
+        write_image(image, path)

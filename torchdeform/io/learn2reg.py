@@ -8,7 +8,6 @@ from torch import Tensor
 
 from torchdeform.core.image import Image
 from torchdeform.io import itk
-from torchdeform.io.files import atomic_folder
 
 
 def voxel_displacement(u: Tensor, fixed: Image, moving: Image) -> Tensor:
@@ -54,5 +53,4 @@ def write_voxel_displacement(u: Tensor, fixed: Image, moving: Image, path: Path)
     image.SetSpacing((*fixed.grid.spacing[::-1], 1.0))
     image.SetOrigin((*fixed.origin, 0.0))
     image.SetDirection(direction.flatten().tolist())
-    with atomic_folder(path.parent) as folder:
-        itk.save(image, folder / path.name)
+    itk.save(image, path)

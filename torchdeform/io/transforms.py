@@ -47,11 +47,8 @@ def write_displacement(u: Tensor, fixed: Image, path: _Path) -> None:
         The world position of a voxel of the fixed image plus its vector is the world position in the moving image
         whose value belongs to that voxel, as in ITK and ANTs. Stored as float32.
     """
-    file = Path(path)
     _check_field(u, fixed, "write_displacement: u")
-    field = itk.to_world_vectors(u, fixed, np.float32)
-    with atomic_folder(file.parent) as folder:
-        itk.save(itk.from_values(field, fixed), folder / file.name)
+    itk.save(itk.from_values(itk.to_world_vectors(u, fixed, np.float32), fixed), Path(path))
 
 
 def read_displacement(path: _Path) -> Image:

@@ -6,7 +6,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchdeform.core.resampling import box_spread, box_sum, centres
+from torchdeform.core.resampling import box_sum, box_sum_transpose, centres
 from torchdeform.metrics.base import (
     IntensityRange,
     Similarity,
@@ -120,7 +120,7 @@ class LocalCrossCorrelation(Similarity):
         each divided by its number of voxels. ε = 1e-5 keeps flat regions finite: they count as not correlated.
         A mask weights the voxels of a window and the windows: E becomes the weighted mean.
         Box sums of 3 fields and the transpose of 3 a call; 3 more for a mask that is not the one of the call before.
-        With stride 3, as `register` has it with windows of 9, what lies between is a 27th in 3D, and maps are as good.
+        With stride 3, as in `register` with windows of 9, there are 27 times fewer windows in 3D, and maps are as good.
         Not differentiable, see `lncc`.
     """
 
@@ -150,7 +150,7 @@ class LocalCrossCorrelation(Similarity):
         a = correlation.mul_(windows.inverse_count * (2 * warped[0, 0].numel() / correlation[0, 0].numel()))
         b = a * covariance / variance
         back = torch.cat([a, b, b * warped_mean - a * windows.mean], dim=1)
-        a, b, rest = box_spread(back, self.window, self.stride, tuple(warped.shape[2:])).chunk(3, dim=1)
+        a, b, rest = box_sum_transpose(back, self.window, self.stride, tuple(warped.shape[2:])).chunk(3, dim=1)
         slope = torch.addcmul(rest, self.fixed, a).addcmul_(warped, b, value=-1)
         return value, slope if windows.weight is None else slope.mul_(windows.weight)
 

@@ -1,9 +1,10 @@
-"""How well two images fit, by what an expert knows about them: overlap and distance of regions, landmarks."""
+"""How well two images fit by what an expert marked: overlap and distance of regions, distance of landmarks."""
 
 from dataclasses import dataclass
+from functools import partial
 
+import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.core.grid import Grid, over_slabs
@@ -41,7 +42,7 @@ class Evaluation:
         before: with both images where they are.
         aligned: after the affine map; None without one.
         after: after the affine map and the displacement.
-        label_interpolation: how the labels of the moving image were carried, a mode of `interpolator`; None without.
+        label_interpolation: how labels of the moving image were interpolated, a mode of `interpolator`; None without.
     """
 
     before: Measures
@@ -86,7 +87,7 @@ def evaluate_images(
         fixed: the fixed image.
         affine: from the world of the fixed image to that of the moving one; None for the identity.
         u: displacement ``(1, D, *S)`` on the fixed grid, applied first.
-        labels: of both images, each in its own place.
+        labels: of both images, on any grid.
         points: landmarks of both in the world ``(1, D, n)``.
     """
     regions = labels and (resample(labels[0], fixed, mode="nearest"), labels[1])
@@ -94,24 +95,14 @@ def evaluate_images(
         return None
 
     def at(world: Affine | None, w: Tensor) -> Measures:
-        seen = regions and (regions[0], _carried_labels(regions[1], fixed, world, w))
-        pairs = points and (carry_points(points[0], fixed, world, w), points[1])
-        return _measures(seen, pairs, fixed.grid, regions and (regions[0], regions[1].data))
+        make = partial(Transform.from_displacement, fixed=fixed, affine=world)
+        warped = regions and (regions[0], make(w).labels(regions[1], fixed).data)
+        pairs = points and (make(w.double()).points(points[0].double().to(w.device)), points[1])
+        return _measures(warped, pairs, fixed.grid, regions and (regions[0], regions[1].data))
 
-    still = u.new_zeros(()).expand_as(u)  # takes no memory
-    aligned = None if affine is None else at(affine, still)
-    return Evaluation(at(None, still), aligned, at(affine, u), regions and LABEL_MODE)
-
-
-def carry_points(points: Tensor, fixed: Image, affine: Affine | None, u: Tensor) -> Tensor:
-    """Return A(φ(p)) for points p of the world ``(1, D, n)``, φ = id + u on the grid of the fixed image."""
-    place = fixed.to_grid(points.double().to(u.device))
-    world = fixed.to_world(place + sample(u.double(), place, fixed.grid))
-    return world if affine is None else affine(world)
-
-
-def _carried_labels(labels: Image, fixed: Image, affine: Affine | None, u: Tensor) -> Tensor:
-    return Transform.from_displacement(u, fixed, affine=affine).labels(labels, fixed).data
+    zero = u.new_zeros(()).expand_as(u)  # takes no memory
+    aligned = None if affine is None else at(affine, zero)
+    return Evaluation(at(None, zero), aligned, at(affine, u), regions and LABEL_MODE)
 
 
 def _warped_labels(labels: Tensor, u: Tensor, grid: Grid) -> Tensor:
@@ -169,7 +160,7 @@ def dice(fixed: Tensor, warped: Tensor, labels: tuple[int, ...]) -> Tensor:
     Args:
         fixed: labels ``(B, 1, *S)``.
         warped: the same shape.
-        labels: the labels looked at.
+        labels: those to compare.
 
     Returns:
         ``(B, L)``, NaN where neither image has the label.
@@ -190,12 +181,12 @@ def hausdorff(
     """Return the larger of both directed distances between the surfaces of every label.
 
     The directed distance from A to B is the percentile of the distances from A's surface voxels to the nearest ones of
-    B's. A surface voxel has a neighbour across a face that is not of the label, or lies at the edge of the image.
+    B's. A surface voxel has a neighbour across a face that is not of the label, or is at the edge of the image.
 
     Args:
         fixed: labels ``(B, 1, *S)``.
         warped: the same shape.
-        labels: the labels looked at.
+        labels: those to compare.
         grid: their grid.
         percentile: 95 by default; 100 gives the Hausdorff distance.
 
@@ -220,36 +211,15 @@ def _require_same(fixed: Tensor, warped: Tensor, name: str) -> None:
 
 
 def _surface_distance(a: Tensor, b: Tensor, grid: Grid, percentile: float) -> float:
+    """Return the larger directed distance between the surfaces of two regions, in the box around both."""
+    from scipy.ndimage import binary_erosion, distance_transform_edt, find_objects
+
     if not (bool(a.any()) and bool(b.any())):
         return float("inf")
-    box = _box(a | b)
-    surfaces = [_surface(region[box]) for region in (a, b)]
-    return max(_directed(x, y, grid, percentile) for x, y in (surfaces, surfaces[::-1]))
-
-
-def _box(region: Tensor) -> tuple[slice, ...]:
-    ends = [(int(place.min()), int(place.max()) + 1) for place in region.nonzero().unbind(1)]
-    return tuple(slice(first, last) for first, last in ends)
-
-
-def _surface(region: Tensor) -> Tensor:
-    """The voxels of a region that fills its box with a neighbour outside it; beyond the box there is none of it."""
-    outside = F.pad(~region, (1, 1) * region.dim(), value=True)
-    near = torch.zeros_like(region)
-    for axis, n in enumerate(region.shape):
-        along = outside
-        for other, m in enumerate(region.shape):
-            along = along if other == axis else along.narrow(other, 1, m)
-        near |= along.narrow(axis, 0, n) | along.narrow(axis, 2, n)
-    return region & near
-
-
-def _directed(a: Tensor, b: Tensor, grid: Grid, percentile: float) -> float:
-    """Return the percentile of the distances from the voxels of a to the nearest of b."""
-    from scipy.ndimage import distance_transform_edt
-
-    distance = torch.as_tensor(distance_transform_edt(~b.numpy(), sampling=grid.spacing))
-    return float(distance[a].quantile(percentile / 100))
+    (box,) = find_objects((a | b).byte().numpy())
+    first, second = (region & ~np.asarray(binary_erosion(region), bool) for region in (a.numpy()[box], b.numpy()[box]))
+    far = [np.asarray(distance_transform_edt(~surface, sampling=grid.spacing)) for surface in (first, second)]
+    return max(float(np.percentile(d[surface], percentile)) for d, surface in zip(far, (second, first), strict=True))
 
 
 def landmark_distances(fixed: Tensor, moving: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torchdeform.metrics.base import (
     weighted,
 )
 
-# The kernels as polynomials: row k holds the coefficients of 1, t, t², .. of what bin i + k gets from a value that lies
+# The kernels as polynomials: row k holds the coefficients of 1, t, t², .. of what bin i + k gets from a value that is
 # t after the start of cell i.
 _CUBIC = (
     (1 / 6, -3 / 6, 3 / 6, -1 / 6),
@@ -47,7 +47,7 @@ class MutualInformation(Similarity):
     """S = Σ P log(P / (P_w P_f)), P being the joint histogram of warped and fixed intensities, or S = (H_w + H_f) / H.
 
     Args:
-        fixed: ``(B, C, *S)``, scaled to about [0, 1]; what lies outside counts as 0 or 1.
+        fixed: ``(B, C, *S)``, scaled to about [0, 1]; what is outside counts as 0 or 1.
         normalised: S = (H_w + H_f) / H with the entropies H of P, P_w and P_f, between 1 and 2.
         bins: along each axis of the histogram, at least 5.
 
@@ -102,8 +102,8 @@ class MutualInformation(Similarity):
         """Return those of tᵖ sᑫ in Σ ∂S/∂P[i + k, j + m] (bins − 3) cubic'_k(t) linear_m(s): ``(q·p, cell)``."""
         cubic, linear = _kernels(slope)
         cubic = cubic[:, 1:] * slope.new_tensor([power * (self.bins - 3) for power in range(1, len(_CUBIC))])
-        around = slope.unfold(1, len(_CUBIC), 1).unfold(2, len(_LINEAR), 1)
-        return torch.einsum("tijkm,kp,mq->qptij", around, cubic, linear).flatten(2).flatten(0, 1)
+        blocks = slope.unfold(1, len(_CUBIC), 1).unfold(2, len(_LINEAR), 1)
+        return torch.einsum("tijkm,kp,mq->qptij", blocks, cubic, linear).flatten(2).flatten(0, 1)
 
     def _derivative(self, warped: Tensor, coefficients: Tensor) -> Tensor:
         """Return the polynomial of its cell at every voxel, 0 where an intensity was cut off."""
@@ -111,8 +111,8 @@ class MutualInformation(Similarity):
         for piece in _pieces(warped):
             cell, t, s = self._locate(warped, piece)
             inside = (warped[piece] >= 0) & (warped[piece] <= 1)
-            own = coefficients.index_select(1, cell).view(len(_LINEAR), -1, len(t))
-            lines = (own[:, 2] * t).add_(own[:, 1]).mul_(t).add_(own[:, 0])
+            local = coefficients.index_select(1, cell).view(len(_LINEAR), -1, len(t))
+            lines = (local[:, 2] * t).add_(local[:, 1]).mul_(t).add_(local[:, 0])
             derivative[piece] = torch.addcmul(lines[0], lines[1], s).mul_(inside)
         return derivative
 
@@ -211,7 +211,7 @@ def _logarithms(table: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _cells(image: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return in which of ``count`` cells between 0 and 1 each value lies, and where in it, from 0 to 1."""
+    """Return in which of ``count`` cells between 0 and 1 each value is, and where in that cell, from 0 to 1."""
     place = image.clamp(0, 1) * count
     cell = place.detach().long().clamp_(0, count - 1)
     return cell, place - cell

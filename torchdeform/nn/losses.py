@@ -10,8 +10,6 @@ from torchdeform.errors import InputError, require_choice
 from torchdeform.metrics.similarity import MEASURES
 from torchdeform.nn.precision import full_precision
 
-SIMILARITIES = {name: measure.function for name, measure in MEASURES.items()}
-
 # Determinants below this share the price 1/J of this one in `DeterminantLoss`, or it would be infinite.
 _SMALLEST = 1e-2
 

@@ -15,7 +15,7 @@ from torchdeform.core.derivatives import CURL_PAIRS, curl, jacobian_determinant
 from torchdeform.core.diagnostics import smallest_determinant
 from torchdeform.core.fold_free import largest_share
 from torchdeform.core.grid import Grid, per_item
-from torchdeform.fem.solver import Method, solver_of
+from torchdeform.fem.solver import solver_of
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
 from torchdeform.solvers.base import Factor
@@ -35,7 +35,7 @@ def _factor(like: Tensor, spacing: Sequence[float], weights: Sequence[float], bo
 
 
 def _make_factor(
-    grid: Grid, weights: tuple[float, float, float], boundary: str, solver: Method, dtype: torch.dtype, device: str
+    grid: Grid, weights: tuple[float, float, float], boundary: str, solver: str, dtype: torch.dtype, device: str
 ) -> Factor:
     system = DivCurlSystem(grid, Weights(*weights), boundary)
     with torch.inference_mode(False):

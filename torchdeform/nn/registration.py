@@ -16,9 +16,6 @@ from torchdeform.registration.optimise import Level, Objective, optimise_level
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.velocity import VelocityMetric
 
-# Measures of images as they are; others compare features, which need warping of their own.
-_MEASURES = tuple(name for name, measure in MEASURES.items() if measure.features is INTENSITIES)
-
 
 class DeformableRegistration(nn.Module):
     """Some steps of `register` on one grid: force = ∂S/∂warped ∇warped, K v = M force, φ ← φ ∘ flow(v).
@@ -46,7 +43,9 @@ class DeformableRegistration(nn.Module):
         settings = settings or RegistrationSettings()
         if steps < 1:
             raise InputError(f"DeformableRegistration: steps must be at least 1, got {steps}")
-        require_choice(settings.similarity.measure, _MEASURES, "DeformableRegistration: similarity")
+        # Others compare features, which are warped in place of the image.
+        measures = [name for name, measure in MEASURES.items() if measure.features is INTENSITIES]
+        require_choice(settings.similarity.measure, measures, "DeformableRegistration: similarity")
         self.grid, self.steps, self.settings = grid, steps, settings
 
     @full_precision

@@ -8,7 +8,7 @@ from torchdeform.core.flow import OdeSolver, integrate
 from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError, require_choice
 from torchdeform.fem.fast_transform import is_exact_for
-from torchdeform.fem.solver import Method, SolverSettings
+from torchdeform.fem.solver import SolverSettings
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
 from torchdeform.nn.operators import div_curl_velocity
@@ -47,7 +47,7 @@ class DivCurlVelocity(nn.Module):
         weight_div: float = 1.0,
         weight_curl: float = 1.0,
         weight_zero: float = 0.0,
-        solver: Method = "auto",
+        solver: str = "auto",
     ) -> None:
         super().__init__()
         require_choice(boundary, _BOUNDARIES, "DivCurlVelocity: boundary")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from torchdeform.errors import InputError, nearest_name, require_choice
+from torchdeform.metrics.similarity import MEASURES
 from torchdeform.registration.settings import SHORT_FORMS, RegistrationSettings
 
 _PRESETS = "presets"
@@ -47,7 +48,7 @@ def load_settings(
     for where, layer in layers:
         values = nested(layer)
         _require_known(RegistrationSettings, values, where)
-        _merge(RegistrationSettings, merged, values)
+        _merge(merged, values)
         sources |= dict.fromkeys(_leaves(values), where)
     return _validate(merged, sources)
 
@@ -184,11 +185,13 @@ def nested(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings by group: ``{"a.b": 1}`` as ``{"a": {"b": 1}}``, and ``solver: cg`` as ``{method: cg}``."""
     tree: dict[str, Any] = {}
     for key, value in values.items():
+        if not isinstance(key, str):
+            raise InputError(f"settings: the name of a setting is a text, got {key!r}")
         *parents, name = key.split(".")
         node = {name: value if parents else _whole_group(name, value)}
         for parent in reversed(parents):
             node = {parent: node}
-        _merge(RegistrationSettings, tree, node)
+        _merge(tree, node)
     return tree
 
 
@@ -196,7 +199,7 @@ def merged_settings(*layers: Mapping[str, Any]) -> dict[str, Any]:
     """Return several mappings of settings as one, the later ones laid over the earlier."""
     tree: dict[str, Any] = {}
     for layer in layers:
-        _merge(RegistrationSettings, tree, nested(layer))
+        _merge(tree, nested(layer))
     return tree
 
 
@@ -205,20 +208,17 @@ def _whole_group(name: str, value: object) -> object:
     if name not in SHORT_FORMS:
         return value
     known = {field.name for field in fields(get_type_hints(RegistrationSettings)[name])}
-    weights = (
-        isinstance(value, Mapping)
-        and not known & value.keys()
-        and all(isinstance(weight, int | float) for weight in value.values())
-    )
-    return {SHORT_FORMS[name]: value} if weights or not isinstance(value, Mapping) else value
+    if not isinstance(value, Mapping):
+        return {SHORT_FORMS[name]: value}
+    weights = name == "similarity" and not known & value.keys() and (not value or MEASURES.keys() & value.keys())
+    return {SHORT_FORMS[name]: value} if weights else value
 
 
-def _merge(kind: Any, base: dict[str, Any], change: Mapping[str, Any]) -> None:
-    """Lay ``change`` over ``base``, group by group of the dataclass ``kind``."""
-    hints = get_type_hints(kind)
+def _merge(base: dict[str, Any], change: Mapping[str, Any]) -> None:
+    """Lay ``change`` over ``base``, mapping by mapping."""
     for key, value in change.items():
-        if isinstance(value, dict) and isinstance(base.get(key), dict) and is_dataclass(hints.get(key)):
-            _merge(hints[key], base[key], value)
+        if isinstance(value, dict) and isinstance(base.get(key), dict):
+            _merge(base[key], value)
         else:
             base[key] = dict(value) if isinstance(value, dict) else value
 
@@ -245,7 +245,7 @@ def _require_known(kind: Any, values: Mapping[str, Any], where: str, prefix: str
     known = [field.name for field in fields(kind)]
     for key, value in values.items():
         if key not in known:
-            raise InputError(f"{where}: there is no setting '{prefix}{key}'{_suggestion(key, known, prefix)}")
+            raise InputError(f"{where}: there is no setting '{prefix}{key}'{_suggestion(str(key), known, prefix)}")
         if not is_dataclass(hints[key]):
             continue
         if not isinstance(value, dict):
@@ -280,5 +280,6 @@ def _validate(values: dict[str, Any], sources: Mapping[str, str]) -> Registratio
     name = ".".join(map(str, first["loc"]))
     inside = [known for known in sources if known.startswith(f"{name}.") and known.rpartition(".")[2] in problem]
     where = next((sources[known] for known in (*inside, name, name.partition(".")[0]) if known in sources), "settings")
-    given = "" if isinstance(first["input"], dict) else f"{name} = {first['input']!r}: "
+    own = first["type"] == "value_error" and isinstance(first["input"], dict)  # of a whole group, with names in it
+    given = "" if own else f"{name} = {first['input']!r}: "
     raise InputError(f"{where}: {given}{problem}")

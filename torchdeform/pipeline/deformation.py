@@ -30,7 +30,7 @@ from torchdeform.io import read_displacement, read_image, write_displacement, wr
 from torchdeform.io.files import atomic_folder, require_writable
 from torchdeform.io.images import ending_like, read_optional
 from torchdeform.report.grids import write_grids
-from torchdeform.report.record import versions, write_json
+from torchdeform.report.record import describe_map, versions, write_json
 from torchdeform.report.report_data import grey, to_unit
 from torchdeform.solvers.base import Status
 
@@ -90,7 +90,7 @@ def adapt_grid_to_file(image: Path, out: Path, settings: GridSettings, device: t
         device: where to compute.
 
     Returns:
-        What ``result.json`` holds.
+        The content of ``result.json``.
 
     Raises:
         InputError: the file, the folder, or a monitor that is not positive.
@@ -135,7 +135,7 @@ def reconstruct_file(
         device: where to compute.
 
     Returns:
-        What ``result.json`` holds; ``distance_max`` is the largest distance between given and reconstructed nodes.
+        The content of ``result.json``; ``distance_max`` is the largest distance between given and reconstructed nodes.
 
     Raises:
         InputError: the file, the folder, order or steps.
@@ -192,7 +192,7 @@ def simulate_file(
         smoothing: standard deviation of the Gaussian that smooths borders, units of spacing; the spacing when None.
 
     Returns:
-        What ``result.json`` holds.
+        The content of ``result.json``.
 
     Raises:
         InputError: the files, positions that differ, labels or factors.
@@ -245,14 +245,11 @@ def _background(image: Image) -> Tensor | None:
 
 def _described(source: Path, u: Tensor, grid: Grid) -> Record:
     """Return what the records of all three commands have in common."""
-    diagnosis = diagnose(u, grid)
     return {
         "source": str(source),
         "size": grid.shape[::-1],
         "spacing": grid.spacing[::-1],
-        "folds": int(diagnosis.folds.item()),
-        "determinant_min": diagnosis.det_min.item(),
-        "determinant_max": diagnosis.det_max.item(),
+        **describe_map(diagnose(u, grid)),
         "displacement_max_voxels": voxels(u, grid).max().item(),
         "versions": versions(),
     }

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.resampling import MIN_NODES, with_voxels
+from torchdeform.core.resampling import MIN_NODES, with_spacing
 from torchdeform.errors import InputError
 from torchdeform.metrics.similarity import Measure, measures_in
 from torchdeform.registration.settings import RegistrationSettings
@@ -167,5 +167,5 @@ def fitting_grid(grid: Grid, limit: int, channels: int, settings: RegistrationSe
     size, coarser = min(grid.spacing), grid
     while footprint(coarser, channels, settings) > limit and max(coarser.shape) > MIN_NODES:
         size /= _SHRINK
-        coarser = with_voxels(grid, size)
+        coarser = with_spacing(grid, size)
     return coarser

@@ -87,7 +87,7 @@ class Outcome:
 
     Attributes:
         result: the result of the registration.
-        record: what ``result.json`` holds, such as ``files``, ``seconds`` by stage and ``warnings``.
+        record: the content of ``result.json``, such as ``files``, ``seconds`` by stage and ``warnings``.
         folder: where the files are.
     """
 

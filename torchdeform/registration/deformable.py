@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.diagnostics import Diagnosis, diagnose, inverse_error, smallest_determinant
-from torchdeform.core.flow import preload
 from torchdeform.core.fold_free import repair_folds
-from torchdeform.core.grid import Grid, threads_worth
+from torchdeform.core.grid import Grid, limit_threads
 from torchdeform.core.image import Image, resample
 from torchdeform.core.resampling import MIN_NODES, prolong
 from torchdeform.core.transform import Affine
@@ -81,7 +80,6 @@ def register(
         ``symmetric`` two maps from a space between move against each other, and φ = φ_m ∘ φ_f⁻¹.
     """
     settings, guidance = config or RegistrationSettings(), guidance or Guidance()
-    preload()
     if isinstance(fixed, Image) and isinstance(moving, Image):
         return _register_images(fixed, moving, settings, guidance, affine, start, callback)
     if isinstance(fixed, Image) or isinstance(moving, Image):
@@ -106,7 +104,7 @@ def _register_tensors(
     space = midspace_of_tensors(problem) if settings.symmetric else None
     found = _optimise(problem, space, settings, start, callback)
     del problem, space
-    with threads_worth(len(found.u), grid):
+    with limit_threads(len(found.u), grid):
         warped = warp(moving, found.u, grid)
         evaluation = evaluate_tensors(found.u, grid, labels=guidance.labels, points=guidance.points)
     return replace(_result(found, grid, warped, settings), evaluation=evaluation)
@@ -226,7 +224,7 @@ def _optimise(
         u, records = optimise_symmetric(space, problem.grid, settings, start, callback)
     else:
         u, records = optimise_levels(problem, settings, start, callback)
-    with threads_worth(len(u), problem.grid):
+    with limit_threads(len(u), problem.grid):
         similarity = forward_similarity(problem, settings)
         before, after = similarity.evaluate()[1], similarity.evaluate(u)[1]
     return _Optimised(u, records, before, after, perf_counter() - began)
@@ -244,7 +242,7 @@ def _checked_start(start: Tensor, problem: RegistrationProblem) -> Tensor:
 
 def _result(found: _Optimised, grid: Grid, warped: Tensor, settings: RegistrationSettings) -> RegistrationResult:
     """Invert the map and measure it."""
-    with threads_worth(len(found.u), grid):
+    with limit_threads(len(found.u), grid):
         start = perf_counter()
         inverse = invert(found.u, grid)
         mean, largest = inverse_error(found.u, inverse, grid)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchdeform.core.flow import OdeSolver, flow
 from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid
-from torchdeform.core.resampling import MIN_NODES, prolong, pyramid_grids, restrict
+from torchdeform.core.resampling import MIN_NODES, hat_average, prolong, pyramid_grids, restrict
 from torchdeform.core.warp import compose, warp
 from torchdeform.errors import InputError
 from torchdeform.fem.solver import SolverSettings
@@ -150,30 +150,13 @@ def _make_search(grid: Grid, level: int, reach: float, settings: DiscreteSetting
 def _match(search: _Search, fixed: Tensor, moving: Tensor, mask: Tensor | None) -> Tensor:
     """Return the smooth field of displacements ``(1, D, *control)`` in units of spacing that matches two images."""
     weight = fixed.new_ones(1, 1, *search.images.shape) if mask is None else mask
-    weight = _average(weight, search.features)
+    weight = hat_average(weight, search.features)
     cost = _cost_volume(_features(search, fixed), _features(search, moving), weight, search)
-    return _couple(cost, _average(weight, search.control).clamp(min=_SMALLEST_WEIGHT), search)
+    return _couple(cost, hat_average(weight, search.control).clamp(min=_SMALLEST_WEIGHT), search)
 
 
 def _features(search: _Search, image: Tensor) -> Tensor:
-    return _average(mind_ssc(restrict(image, search.images, search.source)), search.features)
-
-
-def _average(x: Tensor, coarse: Grid) -> Tensor:
-    """Return the mean of x around each node of a coarser grid of the same box, weighted by its hat function."""
-    for axis, count in enumerate(coarse.shape, start=2):
-        if count != x.shape[axis]:
-            hats = _hats(x.shape[axis], count, x)
-            flat = x.flatten(axis + 1) if axis + 1 < x.dim() else x.unsqueeze(-1)
-            x = (hats @ flat).view(*x.shape[:axis], count, *x.shape[axis + 1 :])
-    return x
-
-
-def _hats(nodes: int, count: int, like: Tensor) -> Tensor:
-    """Return ``(count, nodes)``: hat functions of the coarse nodes at the fine ones, each with sum 1."""
-    place = torch.linspace(0, count - 1, nodes, dtype=like.dtype, device=like.device)
-    hats = (1 - (place - torch.arange(count, device=like.device).unsqueeze(1)).abs()).clamp_(min=0)
-    return hats / hats.sum(1, keepdim=True)
+    return hat_average(mind_ssc(restrict(image, search.images, search.source)), search.features)
 
 
 def _cost_volume(fixed: Tensor, moving: Tensor, weight: Tensor, search: _Search) -> Tensor:
@@ -187,8 +170,8 @@ def _cost_volume(fixed: Tensor, moving: Tensor, weight: Tensor, search: _Search)
         for row, label in zip(part[0], labels[start : start + chunk], strict=True):
             torch.sub(fixed, _shifted(padded, label, search), out=buffer)
             torch.sum(buffer.square_()[0], 0, out=row)
-        cost[start : start + chunk] = _average(part.mul_(weight), search.control)[0].flatten(1)
-    scale = cost.std(dim=0).sum() / _average(weight, search.control).sum()
+        cost[start : start + chunk] = hat_average(part.mul_(weight), search.control)[0].flatten(1)
+    scale = cost.std(dim=0).sum() / hat_average(weight, search.control).sum()
     return cost.div_(scale.clamp(min=_SMALLEST_SCALE))
 
 

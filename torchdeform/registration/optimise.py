@@ -13,8 +13,8 @@ from torch import Tensor
 from torchdeform.core.diagnostics import one_sided_determinant
 from torchdeform.core.flow import flow
 from torchdeform.core.fold_free import largest_share, repair_folds, smooth_elastically, where_items
-from torchdeform.core.grid import Grid, per_item, threads_worth
-from torchdeform.core.resampling import Transfer, prolong, pyramid_grids, thinned
+from torchdeform.core.grid import Grid, limit_threads, per_item
+from torchdeform.core.resampling import Transfer, coarsened, prolong, pyramid_grids
 from torchdeform.core.warp import compose, warp
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity
@@ -204,7 +204,7 @@ def optimise_levels(
         began = perf_counter()
         level = make_level(problem.on(grid), settings, objective or forward_objective, index, len(grids))
         u = level.zero if u is None else repair_folds(prolong(u, level.grid), level.grid)
-        with threads_worth(len(u), grid):
+        with limit_threads(len(u), grid):
             state = optimise_level(level, u, callback)
         u = state.best
         records.append(LevelRecord(level.shape, state.values, state.shortened, perf_counter() - began))
@@ -248,7 +248,7 @@ def steps_on(grid: Grid, steps: int, settings: RegistrationSettings) -> int:
 
 def _map_grid(grid: Grid, settings: RegistrationSettings) -> Grid:
     """Return the grid that carries the map of images on ``grid``."""
-    return thinned(grid, settings.optimiser.map_spacing) if math.prod(grid.shape) > _LARGE else grid
+    return coarsened(grid, settings.optimiser.map_spacing) if math.prod(grid.shape) > _LARGE else grid
 
 
 def optimise_level(

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid, over_slabs
-from torchdeform.core.image import Image
+from torchdeform.core.image import Image, box_corners
 from torchdeform.core.resampling import MIN_NODES
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import compose, invert, sample
@@ -196,7 +196,7 @@ def midspace_frame(fixed: Image, moving: Image, axes: Direction) -> Image:
         InputError: they have too little in common.
     """
     origin = Image(fixed.data.new_zeros(1, 1, *([2] * fixed.grid.dim)), Grid((2,) * fixed.grid.dim), (), axes)
-    corners = [origin.to_grid(_corners(image)).squeeze(0) for image in (fixed, moving)]
+    corners = [origin.to_grid(image.to_world(box_corners(image.grid))).squeeze(0) for image in (fixed, moving)]
     low = torch.stack([corner.amin(1) for corner in corners])
     high = torch.stack([corner.amax(1) for corner in corners])
     margin = _MARGIN * (high.amin(0) - low.amax(0))
@@ -209,11 +209,6 @@ def midspace_frame(fixed: Image, moving: Image, axes: Direction) -> Image:
     first = origin.to_world((low + rest).view(1, -1, 1)).flatten().tolist()
     grid = Grid(tuple(int(n) for n in shape), tuple(spacing.tolist()))
     return Image(fixed.data.new_zeros(1, 1, *grid.shape), grid, tuple(first), axes, "middle")
-
-
-def _corners(image: Image) -> Tensor:
-    ends = [torch.tensor([0.0, side], dtype=torch.float64) for side in image.grid.extent]
-    return image.to_world(torch.cartesian_prod(*ends).T.unsqueeze(0))
 
 
 def _spacing_along(image: Image, place: Image) -> Tensor:

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.diagnostics import smallest_determinant
+from torchdeform.core.fold_free import largest_share
+from torchdeform.core.grid import per_item
 from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Transform, place_of
 from torchdeform.core.warp import compose, invert, max_voxels
@@ -52,9 +54,9 @@ class AveragingSettings:
     """How maps and intensities are averaged.
 
     Args:
-        pose: where the template lies if the images were aligned first: ``reference``, in the reference's own position
+        pose: where the template is if the images were aligned first: ``reference``, in the reference's own position
             and orientation, only its size and shear being averaged; or ``mean``, in the mean position and orientation,
-            for images that lie in one common space.
+            for images in one common space.
         match_intensities: bring all images to one mean and one standard deviation first.
         corrections: how often at most the mean of the maps from the template is brought back to the identity.
         tolerance: largest move of that mean, in voxels, that counts as none.
@@ -89,7 +91,7 @@ class MeanShape:
         inverse: displacement of (id + m)⁻¹ on the same grid.
         affine: P, a map of the world; None where the images were not aligned.
         bias: largest move, in voxels, of the mean of the maps: from the reference, then from the template as corrected
-            once, twice and so on. The last is what was left when it was looked at last.
+            once, twice and so on. The last is what was left at the end.
     """
 
     place: Image
@@ -182,8 +184,8 @@ def _map(reference: Image, image: Image, config: RegistrationSettings | None, ca
 
 def identity_map(image: Image) -> Transform:
     """Return the identity of an image's space, as a displacement of 0 on its grid."""
-    still = image.data.new_zeros(1, image.grid.dim, *image.grid.shape)
-    return Transform.from_displacement(still, image, inverse=still, moving=image)
+    zero = image.data.new_zeros(1, image.grid.dim, *image.grid.shape)
+    return Transform.from_displacement(zero, image, inverse=zero, moving=image)
 
 
 @torch.no_grad()
@@ -193,7 +195,7 @@ def make_template(
     """Return the template of one round: the mean shape and in it the mean of all images.
 
     Args:
-        images: I_i, each looked at once.
+        images: I_i, each read once.
         maps: φ_i from the reference to I_i: a displacement on the reference's grid, then affine maps or none.
         reference: the image that was registered to all.
         settings: how maps and intensities are averaged.
@@ -213,7 +215,7 @@ def make_template(
 
 
 def _pulled(image: Image, from_template: Transform) -> Image:
-    """Return an image on the template's grid, NaN where it knows nothing, by cubic splines within its own range."""
+    """Return an image on the template's grid, NaN outside it, by cubic splines within its own range."""
     low, high = float(image.data.min()), float(image.data.max())
     pulled = from_template.image(image, mode="cubic", outside=float("nan"))
     return replace(pulled, data=pulled.data.clamp(low, high))
@@ -280,14 +282,18 @@ def _mean_displacement(maps: Sequence[Transform], back: Tensor, reference: Image
 
 def _corrected(total: Tensor, mean: Tensor, reference: Image) -> Tensor:
     """Return (id + mean) ∘ (id + total), with less of the mean where all of it would fold."""
-    for _ in range(_HALVINGS):
-        after = compose(mean, total, reference.grid)
-        if bool((smallest_determinant(after, reference.grid) > 0).all()):
-            return after
-        mean = mean / 2
-    raise ComputationError(
-        f"{reference.name}: the mean shape cannot be reached without folds; take another image as reference"
-    )
+    grid = reference.grid
+
+    def corrected(share: Tensor) -> Tensor:
+        return compose(per_item(share, mean) * mean, total, grid)
+
+    def accept(share: Tensor) -> Tensor:
+        return smallest_determinant(corrected(share), grid) > 0
+
+    share = largest_share(accept, mean.new_ones(1), halvings=_HALVINGS)
+    if not bool(share > 0):
+        raise ComputationError(f"{reference.name}: its mean shape folds; take another image as reference")
+    return corrected(share)
 
 
 def _mean_affine(maps: Sequence[Transform], reference: Image, pose: Pose) -> Affine | None:
@@ -319,7 +325,7 @@ def average_intensities(images: Iterable[Image], *, match: bool = True) -> Image
     """Return the mean over the images that are known at each node, 0 where none is.
 
     Args:
-        images: on one grid, NaN where an image knows nothing; looked at once, one after the other.
+        images: on one grid, NaN outside an image; read once, one after the other.
         match: scale each to the average mean and the average standard deviation of all, channel by channel.
 
     Raises:

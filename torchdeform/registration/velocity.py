@@ -62,7 +62,7 @@ class VelocityMetric:
         return self.factor(self.system.load(div=div, force=force), power=self.order)
 
     def ascent(self, force: Tensor, barrier: Tensor | None = None, points: Tensor | None = None) -> Tensor:
-        """Return the velocity of steepest ascent, its longest move being one voxel.
+        """Return the velocity of steepest ascent, of any length.
 
         Args:
             force: force density of the images ``(B, D, *S)``, in any unit; it is scaled to 1 at its strongest.
@@ -81,7 +81,7 @@ class VelocityMetric:
         if points is not None:
             load = points * per_item(scale * (self.grid.cell_volume * weights.zero), points)
             v = v + self.factor(load, power=self.order + 1)
-        return normalise_step(v, self.grid)
+        return v
 
 
 def image_force(slope: Tensor, warped: Tensor, grid: Grid, by: str = "auto") -> Tensor:

@@ -1,4 +1,4 @@
-"""What a person looks at: single pictures, the overview, the page ``report.html`` and the record of a registration."""
+"""Output for people: single pictures, the overview, the page ``report.html`` and the record of a registration."""
 
 from torchdeform.report.page import write_report
 from torchdeform.report.plots import (

@@ -83,7 +83,7 @@ def rotation_scale(limit: float, dim: int) -> Scale:
 def show(axes: "Axes", plane: Plane, pixels: Tensor, **how: Any) -> "AxesImage":
     """Show a slice ``(C, down, across)`` in node coordinates: pixel (i, j) spans i ± 1/2, j ± 1/2."""
     down, across = plane.shape
-    step = 1 + max(pixels.shape[1:]) // _LARGEST  # more pixels than can be seen would only cost time
+    step = 1 + max(pixels.shape[1:]) // _LARGEST  # more pixels than a screen shows would only cost time
     thin = pixels[:, ::step, ::step].movedim(0, -1).float().numpy()
     shown = axes.imshow(
         thin if thin.shape[-1] == 3 else thin[..., 0],

@@ -23,7 +23,7 @@ def write_report(path: Path, data: ReportData, record: Mapping[str, Any] | None 
     Args:
         path: the file to write, usually ``report.html``.
         data: what `make_report_data` returns; the page can show its slices.
-        record: what ``result.json`` holds; when None that of `describe`, which has no commands.
+        record: the content of ``result.json``; when None that of `describe`, which has no commands.
     """
     known = describe(data.result, data.fixed, data.moving) if record is None else record
     page = _render(

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from torchdeform import __version__
+from torchdeform.core.diagnostics import Diagnosis
 from torchdeform.core.image import Image
 from torchdeform.metrics.evaluation import Evaluation, Measures
 from torchdeform.registration.result import LevelRecord, RegistrationResult
@@ -27,17 +28,14 @@ def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[st
     Returns:
         A mapping for `write_json`; sizes are in x, y, z order as in ITK, errors in voxels.
     """
-    diagnosis = result.diagnosis
     return {
         "fixed": _place(fixed),
         "moving": _place(moving),
         "similarity": result.settings.similarity.measure,
         "similarity_before": result.similarity_before.item(),
         "similarity_after": result.similarity_after.item(),
-        "folds": int(diagnosis.folds.item()),
-        "determinant_min": diagnosis.det_min.item(),
-        "determinant_max": diagnosis.det_max.item(),
-        "determinant_log_std": diagnosis.det_log_std.item(),
+        **describe_map(result.diagnosis),
+        "determinant_log_std": result.diagnosis.det_log_std.item(),
         "inverse_error_mean": result.inverse_error_mean.item(),
         "inverse_error_max": result.inverse_error_max.item(),
         "seconds": result.seconds,
@@ -48,6 +46,15 @@ def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[st
         "device": device_name(result.displacement.device),
         "settings": asdict(result.settings),
         "versions": versions(),
+    }
+
+
+def describe_map(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return the folds and the range of the determinant of one map."""
+    return {
+        "folds": int(diagnosis.folds.item()),
+        "determinant_min": diagnosis.det_min.item(),
+        "determinant_max": diagnosis.det_max.item(),
     }
 
 

@@ -30,7 +30,7 @@ class Part:
     """Rows of a table with their heads.
 
     ``fold`` is the text to click on to open them, empty if they are open; ``words`` is the number of columns after the
-    first that hold words, not figures.
+    first with words instead of figures.
     """
 
     head: Sequence[str]

@@ -317,13 +317,13 @@ def _descend(
     running = (code == _RUNNING) & (steps < settings.max_steps)
     while True in (alive := running.tolist()):
         z = r if settings.preconditioner is None else settings.preconditioner(r)
-        before, rz = rz, _dots(r, z)
+        before, rz = rz, dots(r, z)
         p.mul_(_wide(rz / before, p)).add_(z)
         for item, runs in enumerate(alive):
             if not runs:
                 p[item].zero_()
         q = operator(p)
-        curvature = _dots(p, q)
+        curvature = dots(p, q)
         positive = running & (curvature > 0) & (rz > 0)
         alpha = _wide(torch.where(positive, rz / curvature, 0), p)
         x.addcmul_(p, alpha)
@@ -337,13 +337,13 @@ def _descend(
     return code
 
 
-def _dots(a: Tensor, b: Tensor) -> Tensor:
+def dots(a: Tensor, b: Tensor) -> Tensor:
     """Return a·b for each item ``(B,)``, one by one: a batch may be summed in another order than an item alone."""
     return torch.stack([torch.dot(i.reshape(-1), j.reshape(-1)) for i, j in zip(a, b, strict=True)])
 
 
 def _norms(a: Tensor) -> Tensor:
-    return _dots(a, a).sqrt()
+    return dots(a, a).sqrt()
 
 
 def _wide(per_item: Tensor, like: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Workers of a Dask cluster, one pair on each of their threads at a time."""
+"""The engine of a Dask cluster: one pair at a time on each thread of its workers."""
 
 import itertools
 import signal
@@ -15,7 +15,7 @@ from torchdeform.cohort.executors.local import Engine, environment, usable_cores
 from torchdeform.cohort.executors.worker import EngineError, Worker
 from torchdeform.cohort.plan import Job
 from torchdeform.cohort.settings import ClusterSettings, EngineSettings
-from torchdeform.cohort.task import Report, Task, perform
+from torchdeform.cohort.task import PairReport, Task, perform
 from torchdeform.errors import InputError
 from torchdeform.pipeline.memory import readable
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # Names of the resources that a worker declares, as ``dask worker --resources "MEMORY=16e9 GPU=1"``.
 MEMORY, GPU = "MEMORY", "GPU"
 
-# Pairs handed over at a time: so many per worker thread, and at least some; or many, to workers that come and go.
+# Pairs submitted at a time: per worker thread, at least, and to a cluster whose number of workers changes.
 _AHEAD, _LEAST, _MANY = 2, 64, 1024
 _CONNECT = "20s"
 
@@ -35,12 +35,12 @@ _slots = itertools.count()
 
 @contextmanager
 def open_dask(settings: EngineSettings, jobs: Sequence[Job], logs: Path) -> Iterator[Engine]:
-    """Yield the engine of a Dask cluster for these jobs; a cluster that was started for it is gone at the end.
+    """Yield the engine of a Dask cluster for these jobs. A cluster that is started for them stops with the block.
 
     Args:
         settings: of kind ``dask``.
         jobs: what will run.
-        logs: folder for what the queue's jobs print.
+        logs: folder for the output of the queue's jobs.
 
     Raises:
         InputError: Dask is not installed.
@@ -62,25 +62,25 @@ def open_dask(settings: EngineSettings, jobs: Sequence[Job], logs: Path) -> Iter
 
 
 def _threads(settings: EngineSettings) -> int:
-    """Return the threads of a pair, 0 if its worker has to find out."""
+    """Return the threads of a pair, 0 if its worker must find out."""
     if settings.threads != "auto":
         return settings.threads
     return settings.cluster.cores // settings.cluster.workers if settings.cluster else 0
 
 
-def isolated(task: Task, timeout: float, threads: int) -> Report:
-    """Run a task in the process that belongs to this thread of a Dask worker, so that it can be killed alone.
+def isolated(task: Task, timeout: float, threads: int) -> PairReport:
+    """Run a task in the process of this thread of a Dask worker, so that it can be killed alone.
 
     Args:
         task: the pair.
-        timeout: seconds at most.
-        threads: of the process, 0 to divide the machine's cores among the threads of the Dask worker.
+        timeout: limit in seconds.
+        threads: of the process; 0 divides the cores of the machine among the threads of the Dask worker.
     """
     return _own_worker(threads or _share(), task.job.device != "cpu").call(perform, task, timeout=timeout)
 
 
 def _own_worker(threads: int, gpu: bool) -> Worker:
-    """Return the process of this thread, a new one if the former had other settings."""
+    """Return the process of this thread, a new one if the last one had other settings."""
     if getattr(_own, "settings", None) != (threads, gpu):
         if hasattr(_own, "worker"):
             _own.worker.stop()
@@ -98,7 +98,7 @@ def _share() -> int:
 
 
 def _measured(jobs: Sequence[Job]) -> list[int]:
-    """Return what pairs need, found out in a process of its own because that loads ITK."""
+    """Return the memory of pairs, measured in another process because that loads ITK."""
     helper = Worker()
     try:
         return helper.call(measure, jobs)
@@ -118,23 +118,23 @@ def _connect(kind: "type[Client]", where: Any) -> "Client":
 
 
 def _executors(client: "Client", needs: Mapping[str, int], declared: Mapping[str, float]) -> Any:
-    """Return the executor for a job, which asks for its memory and GPU where the workers declare such."""
+    """Return a function from a job to its executor, which asks for the job's memory and GPU if workers have them."""
 
     @cache
-    def executor(wanted: tuple[tuple[str, float], ...]) -> Executor:
-        return client.get_executor(pure=False, resources=dict(wanted))
+    def executor(resources: tuple[tuple[str, float], ...]) -> Executor:
+        return client.get_executor(pure=False, resources=dict(resources))
 
     def choose(job: Job) -> Executor:
         asked = {MEMORY: needs[job.name], GPU: 1 if job.device != "cpu" else 0}
-        # A pair that is too large for every worker runs alone on one, which refuses it with a sentence.
-        wanted = {name: min(asked[name], most) for name, most in declared.items() if name in asked}
-        return executor(tuple(sorted((name, amount) for name, amount in wanted.items() if amount)))
+        # A pair that is too large for every worker runs alone on one, and fails there with a sentence.
+        needed = {name: min(asked[name], most) for name, most in declared.items() if name in asked}
+        return executor(tuple(sorted((name, amount) for name, amount in needed.items() if amount)))
 
     return choose
 
 
 def declared_by(client: "Client") -> dict[str, float]:
-    """Return the resources that every worker of a scheduler declares, the largest amount of each; waits for workers."""
+    """Return the largest amount of every resource that all workers of a scheduler declare; waits for a worker."""
     client.wait_for_workers(1)
     workers = [info["resources"] for info in client.scheduler_info(n_workers=-1)["workers"].values()]
     common = set.intersection(*map(set, workers))
@@ -142,16 +142,16 @@ def declared_by(client: "Client") -> dict[str, float]:
 
 
 def declared_of(cluster: ClusterSettings) -> dict[str, float]:
-    """Return the resources of each worker of a cluster that is described."""
+    """Return the resources of each worker of a cluster in the cohort file."""
     gpus = {GPU: float(cluster.gpus)} if cluster.gpus else {}
     return {MEMORY: float(cluster.memory)} | gpus
 
 
 def start(cluster: ClusterSettings, logs: Path) -> Any:
-    """Return a cluster, a context manager that stops it, and ask for its workers.
+    """Start a cluster and return it; it is a context manager that stops it.
 
     Raises:
-        InputError: a queue, and dask-jobqueue is not installed.
+        InputError: a queue without dask-jobqueue being installed.
     """
     if cluster.kind == "local":
         from distributed import LocalCluster
@@ -162,28 +162,30 @@ def start(cluster: ClusterSettings, logs: Path) -> Any:
                 threads_per_worker=cluster.workers,
                 memory_limit=0,
                 resources=declared_of(cluster),
-                dashboard_address="127.0.0.1:0",  # any port that is free, seen from here only
+                dashboard_address="127.0.0.1:0",  # any free port, visible on this machine only
             )
     queue = make_queue(cluster, logs)
-    queue.adapt(minimum_jobs=cluster.jobs, maximum_jobs=cluster.jobs)  # replaces jobs whose time is over
+    queue.adapt(
+        minimum_jobs=cluster.jobs, maximum_jobs=cluster.jobs
+    )  # replaces jobs that have reached their time limit
     return queue
 
 
 @contextmanager
 def _ignoring_interrupts() -> Iterator[None]:
-    """Let processes that are started meanwhile leave Ctrl-C to this one, which ends them in order."""
+    """Start processes in this block so that they ignore Ctrl-C; this process ends them in order."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    former = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    earlier = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, former)
+        signal.signal(signal.SIGINT, earlier)
 
 
 def make_queue(cluster: ClusterSettings, logs: Path) -> Any:
-    """Return a cluster of dask-jobqueue, without any workers yet."""
+    """Return a cluster of dask-jobqueue, still without workers."""
     try:
         import dask_jobqueue
     except ImportError as error:

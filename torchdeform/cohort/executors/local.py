@@ -1,4 +1,4 @@
-"""Processes of this machine, one pair at a time in each."""
+"""The engine of this machine: worker processes with one pair at a time in each."""
 
 import os
 import queue
@@ -14,7 +14,7 @@ from torchdeform.cohort.estimate import measure
 from torchdeform.cohort.executors.worker import Worker
 from torchdeform.cohort.plan import Job
 from torchdeform.cohort.settings import EngineSettings
-from torchdeform.cohort.task import Report, Task, perform
+from torchdeform.cohort.task import PairReport, Task, perform
 from torchdeform.pipeline.memory import available
 
 
@@ -24,39 +24,35 @@ class Engine:
 
     Attributes:
         executor: the executor for a job, by what the job needs.
-        window: how many jobs are handed over at a time.
+        window: number of jobs that are submitted at a time.
         function: what the executor calls with a task.
-        arguments: and with these besides.
+        arguments: further arguments of that function.
     """
 
     executor: Callable[[Job], Executor]
     window: int
-    function: Callable[..., Report] = perform
+    function: Callable[..., PairReport] = perform
     arguments: tuple[object, ...] = ()
 
-    def submit(self, task: Task) -> Future[Report]:
-        """Hand a pair over."""
+    def submit(self, task: Task) -> Future[PairReport]:
+        """Submit a pair."""
         return self.executor(task.job).submit(self.function, task, *self.arguments)
 
 
 _AHEAD = 4  # pairs in the queue per worker
-
-
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS")
-
-
 _GPUS = "CUDA_VISIBLE_DEVICES"
 
 
 class LocalExecutor(Executor):
-    """Makes calls in worker processes; a call that kills its process fails alone.
+    """Makes calls in worker processes. A call that kills its process fails alone.
 
     Args:
         workers: the processes, each busy with one call at a time.
-        timeout: seconds of a call at most, None for no limit.
+        timeout: limit of a call in seconds, None without a limit.
 
     Notes:
-        `concurrent.futures.ProcessPoolExecutor` breaks as a whole when one of its processes dies, and cannot end a
+        `concurrent.futures.ProcessPoolExecutor` fails as a whole when one of its processes dies, and cannot stop a
         call that hangs.
     """
 
@@ -70,7 +66,7 @@ class LocalExecutor(Executor):
             thread.start()
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Return the future of ``fn(*args)``; see `Worker.call` for what can go wrong."""
+        """Return the future of ``fn(*args)``; see `Worker.call` for its errors."""
         if self._closed:
             raise RuntimeError("the executor is shut down")
         if kwargs:
@@ -80,7 +76,7 @@ class LocalExecutor(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes: when all calls are done, or now (``cancel_futures``), with the calls that they make."""
+        """End the processes: after the last call, or at once with their calls (``cancel_futures``)."""
         self._closed = True
         if cancel_futures:
             self._cancel()
@@ -103,19 +99,19 @@ class LocalExecutor(Executor):
             future, function, args = call
             if future.set_running_or_notify_cancel():
                 self._settle(future, worker, function, args)
-            del call, future  # its result must not live until the next call
+            del call, future  # or the result would stay in memory until the next call
         worker.stop()
 
     def _settle(self, future: Future[Any], worker: Worker, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
         try:
             future.set_result(worker.call(function, *args, timeout=self._timeout))
-        except Exception as error:  # noqa: BLE001 - the future carries it
+        except Exception as error:  # noqa: BLE001 - the future raises it
             future.set_exception(error)
 
 
 @contextmanager
 def open_local(settings: EngineSettings, jobs: Sequence[Job]) -> Iterator[Engine]:
-    """Yield the engine of this machine for these jobs; its processes are gone at the end."""
+    """Yield the engine of this machine for these jobs. Its processes end with the block."""
     gpus = visible_gpus() if any(job.device != "cpu" for job in jobs) else []
     first = Worker(environment(0, gpus=gpus))
     try:
@@ -132,20 +128,20 @@ def open_local(settings: EngineSettings, jobs: Sequence[Job]) -> Iterator[Engine
 
 
 def _fitting(needs: Sequence[int], gpus: Sequence[str]) -> int:
-    """Return how many pairs may run at a time: one a GPU, or a core; and no more than memory holds of the largest."""
+    """Return how many pairs may run at a time: one per GPU or core, and no more than fit into memory."""
     free = available()
     room = len(needs) if free is None or max(needs) == 0 else free // max(needs)
     return max(1, min(len(gpus) or usable_cores(), len(needs), room))
 
 
 def environment(threads: int, *, slot: int = 0, gpus: Sequence[str] = ()) -> dict[str, str]:
-    """Return the variables of a worker: its threads (0 for what is set), and its own GPU if there are any."""
+    """Return the environment of a worker: its threads (0 leaves them as they are), and its own GPU if there is one."""
     counts = dict.fromkeys(_THREADS, str(threads)) if threads else {}
     return counts | ({_GPUS: gpus[slot % len(gpus)]} if gpus else {})
 
 
 def visible_gpus() -> list[str]:
-    """Return the GPUs that this process may use, by the names that ``CUDA_VISIBLE_DEVICES`` takes."""
+    """Return the GPUs that this process may use, by their names in ``CUDA_VISIBLE_DEVICES``."""
     import torch
 
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
@@ -154,7 +150,7 @@ def visible_gpus() -> list[str]:
 
 
 def usable_cores() -> int:
-    """Return the cores that this process may use: by affinity, and by the share that its control group has."""
+    """Return the cores that this process may use, by its affinity and by the quota of its control group."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min([cores, *_quotas()]))
 

@@ -1,4 +1,4 @@
-"""A Python process of our own that makes one call after the other, and may die without harm to anybody else."""
+"""A Python process that makes one call after the other. If it dies, only its call is lost."""
 
 import os
 import pickle
@@ -16,33 +16,33 @@ from torchdeform.errors import ComputationError
 
 T = TypeVar("T")
 
-_STARTS = 3  # times that a process is started before it is said that none can be
-_OOM_SCORE = 500  # of 1000: how readily Linux kills a worker, rather than anything else, when memory runs out
+_STARTS = 3  # attempts to start a process
+_OOM_SCORE = 500  # of 1000: with it Linux kills a worker before other processes when memory runs out
 _READY = "ready"
 
 
 class EngineError(ComputationError):
-    """No pair can run here; nothing is wrong with any pair."""
+    """No pair can run here, whatever the pair."""
 
 
 class WorkerLost(ComputationError):
-    """The process that made a call ended before it had an answer."""
+    """The process of a call ended before it had an answer."""
 
 
 class TimeLimit(ComputationError):
-    """A call took too long, and its process was killed."""
+    """A call took too long and its process was killed."""
 
 
 class Worker:
-    """A process that makes calls, started with the first of them and anew when it is lost.
+    """A process that makes calls. It starts with the first call, and again after it was lost.
 
     Args:
         environment: variables set for it before anything is imported.
 
     Notes:
-        Not a process of `multiprocessing`: its main module is not the caller's, so no script has to be guarded, and
-        libraries that read their environment when they are loaded find it.
-        It ends by itself, in the middle of a call, as soon as this process is gone.
+        It is no process of `multiprocessing`: it does not import the caller's main module, so scripts need no guard,
+        and libraries that read the environment when they are imported find it set.
+        It ends by itself, even in the middle of a call, as soon as the caller's process is gone.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
@@ -51,16 +51,16 @@ class Worker:
         self._stopped = False
 
     def call(self, function: Callable[..., T], *args: object, timeout: float | None = None) -> T:
-        """Return ``function(*args)``, which and whose answer can be pickled.
+        """Return ``function(*args)``; function, arguments and answer must allow pickling.
 
         Args:
             function: of a module that can be imported.
             args: its arguments.
-            timeout: seconds; the process is killed after them. The start of the process does not count.
+            timeout: seconds after which the process is killed, without its start.
 
         Raises:
             WorkerLost: the process ended.
-            TimeLimit: it took too long.
+            TimeLimit: the call took too long.
             EngineError: no process can be started.
             Exception: what the function raised.
         """
@@ -73,7 +73,7 @@ class Worker:
         finally:
             timer.cancel()
             timer.join()
-            if expired.is_set():  # perhaps just after the answer
+            if expired.is_set():  # the answer may have come just before
                 self._process = None
         value, raised = answer
         if raised is not None:
@@ -81,7 +81,7 @@ class Worker:
         return value
 
     def stop(self) -> None:
-        """Kill the process, and start none again."""
+        """Kill the process and start no other."""
         self._stopped = True
         if self._process is not None:
             self._process.kill()
@@ -103,11 +103,11 @@ class Worker:
                     return process
             process.kill()
             self._reap(process)
-        raise EngineError("worker processes do not start here; what they said stands above or in the worker's log")
+        raise EngineError("worker processes do not start here; see their messages above or in the worker's log")
 
     @staticmethod
     def _limit(process: subprocess.Popen[bytes], timeout: float | None) -> tuple[threading.Event, threading.Timer]:
-        """Return an event that tells whether time ran out, and the running timer that sets it and kills."""
+        """Return an event that is set when the time is over, and the running timer that sets it and kills."""
         expired = threading.Event()
 
         def expire() -> None:
@@ -124,7 +124,7 @@ class Worker:
         self._reap(process)
         self._process = None
         if timeout is not None:
-            return TimeLimit(f"it was given up after {timeout:g} seconds; raise engine.timeout if it needs more")
+            return TimeLimit(f"it was stopped after {timeout:g} seconds; raise engine.timeout if it needs more")
         return WorkerLost(_exit_reason(process.returncode))
 
     @staticmethod
@@ -137,7 +137,7 @@ class Worker:
 
 
 def _exit_reason(code: int) -> str:
-    """Return why a process ended, as far as its exit code tells."""
+    """Return why a process ended, as far as its exit code says."""
     if code == -9:
         return (
             "its process was killed from outside, most likely because memory ran out; "
@@ -145,11 +145,11 @@ def _exit_reason(code: int) -> str:
         )
     if code < 0:
         return f"its process crashed with signal {-code}; see its log, and report it"
-    return f"its process ended with exit code {code} in the middle; see its log, and report it"
+    return f"its process ended with exit code {code} during the call; see its log, and report it"
 
 
 def _launch(environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
-    """Start a process that imports from where this one does, in a session of its own, so Ctrl-C is left to us."""
+    """Start a process with the same import path, in its own session so that Ctrl-C reaches only the caller."""
     code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()"
     return subprocess.Popen(
         [sys.executable, "-c", code],
@@ -175,7 +175,7 @@ def _receive(process: subprocess.Popen[bytes]) -> Any:
 
 
 def serve() -> None:
-    """Make the calls that come in by stdin and answer on stdout, until stdin ends; what others print goes to stderr."""
+    """Make the calls read from stdin and answer on stdout until stdin ends. Everything printed goes to stderr."""
     calls: queue.SimpleQueue[tuple[Callable[..., object], tuple[object, ...]]] = queue.SimpleQueue()
     with os.fdopen(os.dup(0), "rb") as source, os.fdopen(os.dup(1), "wb") as sink:
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
@@ -189,13 +189,13 @@ def serve() -> None:
 
 
 def _listen(source: IO[bytes], calls: queue.SimpleQueue[Any]) -> None:
-    """Pass calls on; when nobody is there to make them any more, end the process at once."""
+    """Pass calls on. When stdin ends, the caller is gone: end the process at once."""
     try:
         while True:
             calls.put(pickle.load(source))
     except EOFError:
         os._exit(0)
-    except BaseException as error:  # noqa: BLE001 - a call that cannot be read ends the process: its caller notices
+    except BaseException as error:  # noqa: BLE001 - a call that cannot be read ends the process, which its caller notices
         sys.excepthook(type(error), error, error.__traceback__)
         os._exit(1)
 
@@ -203,20 +203,20 @@ def _listen(source: IO[bytes], calls: queue.SimpleQueue[Any]) -> None:
 def _attempt(function: Callable[..., object], args: tuple[object, ...]) -> tuple[object, Exception | None]:
     try:
         return function(*args), None
-    except Exception as error:  # noqa: BLE001 - raised again where the call came from
+    except Exception as error:  # noqa: BLE001 - raised again by the caller
         return None, error
 
 
 def _answer(sink: IO[bytes], answer: object) -> None:
     try:
         message = pickle.dumps(answer)
-    except Exception as error:  # noqa: BLE001 - the caller waits for some answer
+    except Exception as error:  # noqa: BLE001 - the caller waits for an answer
         message = pickle.dumps((None, ComputationError(f"the answer cannot be sent: {error}")))
     sink.write(message)
     sink.flush()
 
 
 def _raise_oom_score() -> None:
-    """Ask Linux to kill this process first, rather than the one that keeps the books."""
+    """Ask Linux to kill this process rather than the one that runs the cohort."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(str(_OOM_SCORE), encoding="ascii")

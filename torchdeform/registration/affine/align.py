@@ -10,7 +10,7 @@ from torch import Tensor
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, luminance, require_registrable, resample
 from torchdeform.core.intensities import fill, to_common_scale
-from torchdeform.core.resampling import with_voxels
+from torchdeform.core.resampling import with_spacing
 from torchdeform.core.transform import Affine
 from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.metrics.correlation import ForegroundLNCC
@@ -215,7 +215,7 @@ def _make_objectives(
     ``size`` is how much larger things are in the moving image: its voxels are larger by as much, to blur both alike.
     """
     voxel = min(fixed.image.grid.spacing)
-    while math.prod(with_voxels(fixed.image.grid, voxel).shape) > settings.nodes_in(fixed.image.grid.dim):
+    while math.prod(with_spacing(fixed.image.grid, voxel).shape) > settings.nodes_in(fixed.image.grid.dim):
         voxel *= _COARSER
     objectives = []
     while True:
@@ -223,7 +223,7 @@ def _make_objectives(
         objectives.insert(0, _make_objective(fixed, moving, frame, settings))
         voxel *= 2
         shape = fixed.image.grid.shape
-        if math.prod(shape) <= COARSEST_NODES or with_voxels(fixed.image.grid, voxel).shape == shape:
+        if math.prod(shape) <= COARSEST_NODES or with_spacing(fixed.image.grid, voxel).shape == shape:
             return objectives
 
 

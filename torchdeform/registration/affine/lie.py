@@ -1,7 +1,8 @@
-"""Maps of the plane and of space as matrices: which moves each kind of alignment allows, and rotations to try."""
+"""Groups of maps of the plane and of space: the moves that each kind of alignment allows, and rotations to try."""
 
 import itertools
 import math
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -63,6 +64,7 @@ def homogeneous(linear: Tensor, shift: Tensor) -> Tensor:
     return matrix
 
 
+@cache
 def rotations(dim: int) -> Tensor:
     """Return rotations that leave no other further than 5° (2D) or 45° (3D) away, the identity first.
 
@@ -79,31 +81,16 @@ def _circle() -> Tensor:
 
 
 def _icosahedron() -> Tensor:
-    """Return rotations from the 120 unit quaternions of the icosahedral group, one of each ± pair."""
-    units = [[float(i == k) for i in range(4)] for k in range(4)]
-    halves = [[0.5 * s for s in signs] for signs in itertools.product((1, -1), repeat=4)]
-    even = [p for p in itertools.permutations(range(4)) if _is_even(p)]
-    golden = [
-        [(a * _GOLDEN / 2, b / 2, c / (2 * _GOLDEN), 0.0)[i] for i in p]
-        for p in even
-        for a, b, c in itertools.product((1, -1), repeat=3)
-    ]
-    every = [tuple(float(x) for x in q) for q in units + halves + golden]
-    return _from_quaternions(torch.tensor([q for q in every if next(x for x in q if x != 0) > 0], dtype=torch.float64))
-
-
-def _is_even(order: tuple[int, ...]) -> bool:
-    return sum(a > b for a, b in itertools.combinations(order, 2)) % 2 == 0
-
-
-def _from_quaternions(q: Tensor) -> Tensor:
-    w, x, y, z = q.unbind(dim=1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=1).view(-1, 3, 3)
+    """Return all products of a turn by 72° about one of its vertices and a half turn about the middle of an edge."""
+    x, y, z = (2 * math.pi / 5 * v / math.hypot(1, _GOLDEN) for v in (0, _GOLDEN, 1))
+    fifth = torch.matrix_exp(torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64))
+    half = torch.diag(torch.tensor([-1, -1, 1], dtype=torch.float64))
+    found = torch.eye(3, dtype=torch.float64).unsqueeze(0)
+    while len(found) < 60:
+        for new in torch.cat([fifth @ found, half @ found]):
+            if (found - new).abs().amax((1, 2)).min() > 1e-6:
+                found = torch.cat([found, new.unsqueeze(0)])
+    return found
 
 
 _ROTATIONS = {2: _circle, 3: _icosahedron}

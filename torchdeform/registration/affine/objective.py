@@ -9,7 +9,7 @@ from torch import Tensor
 from torchdeform.core.derivatives import derivative
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, box_corners
-from torchdeform.core.resampling import restrict, with_voxels
+from torchdeform.core.resampling import restrict, with_spacing
 from torchdeform.core.warp import sample
 from torchdeform.metrics.similarity import Similarity
 from torchdeform.registration.affine.lie import homogeneous
@@ -36,7 +36,7 @@ class MaskedImage:
     def coarser(self, voxel: float) -> "MaskedImage":
         """Return both at voxels of about this width, smoothed so that nothing aliases; thicker voxels stay."""
         grid = self.image.grid
-        coarse = with_voxels(grid, voxel)
+        coarse = with_spacing(grid, voxel)
         weight = None if self.weight is None else restrict(self.weight, grid, coarse)
         return MaskedImage(replace(self.image, data=restrict(self.image.data, grid, coarse), grid=coarse), weight)
 

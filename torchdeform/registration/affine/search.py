@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchdeform.core.grid import threads_worth
+from torchdeform.core.grid import limit_threads
 from torchdeform.core.image import background, centre_of_mass
 from torchdeform.registration.affine.bfgs import maximise
 from torchdeform.registration.affine.lie import angle, generators, homogeneous, rotations
@@ -33,21 +33,6 @@ _SAME_SIZE = 1.1
 
 
 @dataclass(frozen=True)
-class Start:
-    """A map to start from.
-
-    Attributes:
-        name: where it comes from.
-        map: matrix ``(D + 1, D + 1)`` in the coordinates of the `NormalisedFrame`.
-        turned: whether it is more than a shift and a scale.
-    """
-
-    name: str
-    map: Tensor
-    turned: bool
-
-
-@dataclass(frozen=True)
 class Candidate:
     """A map on its way to the alignment.
 
@@ -55,11 +40,13 @@ class Candidate:
         name: the start it comes from.
         map: matrix ``(D + 1, D + 1)`` in the coordinates of the `NormalisedFrame`.
         value: its similarity on the last level.
+        turned: whether the start is more than a shift and a scale.
     """
 
     name: str
     map: Tensor
-    value: float
+    value: float = 0.0
+    turned: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,9 +80,9 @@ def optimised(
 ) -> list[Candidate]:
     """Return the candidates after some steps of `maximise`, the most similar first."""
     starts = torch.stack([c.map for c in candidates])
-    with threads_worth(len(candidates) * objective.fields, objective.fixed.image.grid):
+    with limit_threads(len(candidates) * objective.fields, objective.fixed.image.grid):
         maps, values = maximise(objective, starts, moves, steps=steps, shortest=shortest)
-    moved = [Candidate(c.name, m, float(v)) for c, m, v in zip(candidates, maps, values, strict=True)]
+    moved = [replace(c, map=m, value=float(v)) for c, m, v in zip(candidates, maps, values, strict=True)]
     return sorted(moved, key=lambda c: -c.value)
 
 
@@ -126,7 +113,7 @@ def search(objective: AffineObjective, kind: str, *, turn: bool, steps: int) -> 
 
 
 def _try(
-    objective: AffineObjective, starts: list[Start], kind: str, steps: int, most: int
+    objective: AffineObjective, starts: list[Candidate], kind: str, steps: int, most: int
 ) -> tuple[list[Candidate], float]:
     """Return the maps found from the most promising starts, median + merit being their value, and the median."""
     maps = torch.stack([start.map for start in starts])
@@ -136,14 +123,14 @@ def _try(
         return [], 0.0
     median = float(value[finite].median())
     merit = (value - median) * overlap.clamp(max=1.0)
-    chosen = [Candidate(starts[i].name, maps[i], 0.0) for i in _promising(starts, maps, merit, most)]
+    chosen = [starts[i] for i in _promising(starts, maps, merit, most)]
     ends = optimised(objective, chosen, generators(kind, objective.dim), steps, _SHORTEST)
     value, overlap = objective.values(torch.stack([c.map for c in ends]))
     merit = (value - median) * overlap.clamp(max=1.0)
     return [replace(c, value=median + float(m)) for c, m in zip(ends, merit, strict=True)], median
 
 
-def _promising(starts: list[Start], maps: Tensor, merit: Tensor, most: int) -> list[int]:
+def _promising(starts: list[Candidate], maps: Tensor, merit: Tensor, most: int) -> list[int]:
     """Return the starts to optimise: all without a rotation, then the best of the others that are not alike."""
     chosen = [i for i, start in enumerate(starts) if not start.turned and merit[i] > -torch.inf]
     for i in merit.argsort(descending=True, stable=True).tolist():
@@ -201,7 +188,7 @@ def image_moments(part: MaskedImage, frame: NormalisedFrame) -> Moments:
     return Moments(mass.squeeze(1), covariance, (points[:, 0] + points[:, -1]) / 2)
 
 
-def make_starts(fixed: Moments, moving: Moments, *, turn: bool, scale: bool, mirror: bool = False) -> list[Start]:
+def make_starts(fixed: Moments, moving: Moments, *, turn: bool, scale: bool, mirror: bool = False) -> list[Candidate]:
     """Return the maps to try, those without a rotation first.
 
     Args:
@@ -229,11 +216,11 @@ def make_starts(fixed: Moments, moving: Moments, *, turn: bool, scale: bool, mir
     return sorted(found, key=lambda s: s.turned)
 
 
-def _about(name: str, linear: Tensor, start: Tensor, end: Tensor) -> Start:
+def _about(name: str, linear: Tensor, start: Tensor, end: Tensor) -> Candidate:
     degrees = float(angle(linear)) if torch.linalg.det(linear) > 0 else 180.0
     turned = degrees > 1.0
     full = f"{name}, turned by {degrees:.0f}°" if turned else name
-    return Start(full, homogeneous(linear, end - linear @ start), turned)
+    return Candidate(full, homogeneous(linear, end - linear @ start), turned=turned)
 
 
 def _axes(fixed: Moments, moving: Moments) -> list[Tensor]:
