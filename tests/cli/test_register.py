@@ -99,11 +99,11 @@ def test_quiet_is_quiet(folder, engine, capfd):
 
 def test_a_second_run_replaces_its_own_files_only(folder, engine):
     assert main(["fixed.png", "moving.png", "--out", "out", "--quiet"]) == 0
-    (folder / "out" / "notes.txt").write_text("mine")
+    (folder / "out" / "notes.txt").write_text("mine", encoding="utf-8")
     write_image(read_image("moving.png"), "moving.tif")
     assert main(["fixed.png", "moving.tif", "--out", "out", "--quiet"]) == 0
     assert _names(folder / "out") == sorted([*RESULTS, "warped.tif", "notes.txt"])
-    assert (folder / "out" / "notes.txt").read_text() == "mine"
+    assert (folder / "out" / "notes.txt").read_text(encoding="utf-8") == "mine"
 
 
 def test_a_failure_keeps_the_earlier_results(folder, engine, capsys, monkeypatch):
@@ -236,7 +236,12 @@ def test_help_names_every_option(capsys):
 
 
 def test_progress_is_shown_on_a_terminal_only(folder, engine, capsys, monkeypatch):
-    monkeypatch.setenv("FORCE_COLOR", "1")  # makes rich believe in a terminal
+    for name, value in {
+        "FORCE_COLOR": "1",
+        "TERM": "xterm",
+        "COLUMNS": "100",
+    }.items():  # what rich takes for a terminal
+        monkeypatch.setenv(name, value)
     assert main(["fixed.png", "moving.png"]) == 0
     assert "level 2/2" in capsys.readouterr().err
 

@@ -1,5 +1,7 @@
 """Where pairs come from: who is paired with whom, what goes along, and what is refused."""
 
+import errno
+import os
 import re
 
 import pytest
@@ -166,7 +168,7 @@ def test_wrong_tables(cohort_of, tmp_path, text, sentence):
 
 
 def test_files_that_are_no_table(cohort_of, tmp_path):
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match=os.strerror(errno.ENOENT)):
         pair_specs(cohort_of("pairs: {table: {file: no.csv}}\n"))
     with pytest.raises(InputError, match="the ending of a table"):
         pair_specs(cohort_of("pairs: {table: {file: no.xlsx}}\n"))

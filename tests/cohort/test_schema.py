@@ -1,6 +1,8 @@
 """The cohort file: what it means, what is refused and where, and what editors are told."""
 
+import errno
 import json
+import os
 
 import pytest
 
@@ -104,7 +106,7 @@ def test_out_is_needed(tmp_path):
 
 
 def test_files_that_are_no_cohort(tmp_path):
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match=os.strerror(errno.ENOENT)):
         read_cohort(tmp_path / "no.yaml")
     (tmp_path / "list.yaml").write_text("- a\n", encoding="utf-8")
     with pytest.raises(InputError, match="must hold 'key: value' lines"):
