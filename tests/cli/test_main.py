@@ -126,7 +126,13 @@ def test_no_command_shows_the_help(capsys):
 
 
 RECORDS = {
-    "register fixed.nii.gz moving.nii.gz --out out --set 'steps=[2]'": {"folds", "settings", "files", "out", "seconds"},
+    "register fixed.nii.gz moving.nii.gz --out out --set 'optimiser.steps=[2]'": {
+        "folds",
+        "settings",
+        "files",
+        "out",
+        "seconds",
+    },
     "check fixed.nii.gz moving.nii.gz": {"fixed", "moving", "findings", "picture"},
     "check fixed.nii.gz moving.nii.gz --out o.png": {"fixed", "moving", "findings", "picture"},
     "jacobian transform.h5 --out j.nii.gz": {"determinant_min", "determinant_max", "determinant_mean", "folds", "out"},

@@ -80,12 +80,15 @@ def test_volumes_end_to_end(folder, engine):
 
 
 def test_record_says_what_ran(folder, engine):
-    (folder / "my.yaml").write_text("steps: [4, 2]\n", encoding="utf-8")
+    (folder / "my.yaml").write_text("optimiser: {steps: [4, 2]}\n", encoding="utf-8")
     assert (
-        torchdeform(["register", "fixed.png", "moving.png", "--config", "my.yaml", "--set", "window=7", "--quiet"]) == 0
+        torchdeform(
+            ["register", "fixed.png", "moving.png", "--config", "my.yaml", "--set", "similarity.window=7", "--quiet"]
+        )
+        == 0
     )
     record = json.loads((folder / "moving" / "result.json").read_text(encoding="utf-8"))
-    assert (record["settings"]["steps"], record["settings"]["window"]) == ([4, 2], 7)
+    assert (record["settings"]["optimiser"]["steps"], record["settings"]["similarity"]["window"]) == ([4, 2], 7)
     assert set(record["seconds"]) == {"read", "optimise", "write", "draw"}
     assert sorted(record["files"]) == _names(folder / "moving")
     assert record["moving"]["path"] == "moving.png"
@@ -183,7 +186,7 @@ def _channels():
         (_nan, ["bad.nii.gz", "moving.png"], "bad.nii.gz has pixels that are NaN"),
         (_elsewhere, ["fixed.png", "bad.mha", "--align", "none"], "overlap"),
         (_channels, ["fixed.png", "bad.mha"], "bad.mha 5, which do not correspond"),
-        (None, ["fixed.png", "moving.png", "--set", "windw=5"], "did you mean 'window'?"),
+        (None, ["fixed.png", "moving.png", "--set", "windw=5"], "did you mean 'similarity.window'?"),
         (None, ["fixed.png", "moving.png", "--set", "window"], "--set needs key=value"),
         (None, ["fixed.png", "moving.png", "--preset", "fst"], "did you mean 'fast'?"),
         (None, ["fixed.png", "moving.png", "--config", "no.yaml"], "no.yaml cannot be read"),
@@ -260,7 +263,20 @@ def test_the_real_engine(folder, make_image, make_displacement):
     write_image(fixed, "one.nrrd")
     write_image(replace(fixed, data=deformed), "two.nrrd")
     assert (
-        main(["one.nrrd", "two.nrrd", "--set", "steps=[20, 10]", "--align", "none", "--device", "cpu", "--quiet"]) == 0
+        main(
+            [
+                "one.nrrd",
+                "two.nrrd",
+                "--set",
+                "optimiser.steps=[20, 10]",
+                "--align",
+                "none",
+                "--device",
+                "cpu",
+                "--quiet",
+            ]
+        )
+        == 0
     )
     record = json.loads((folder / "two" / "result.json").read_text(encoding="utf-8"))
     assert record["folds"] == 0
