@@ -216,7 +216,7 @@ def _whole_group(name: str, value: object) -> object:
 
 
 def _merge(base: dict[str, Any], change: Mapping[str, Any]) -> None:
-    """Lay ``change`` over ``base``, mapping by mapping; weights of measures that are given as a whole replace others."""
+    """Lay ``change`` over ``base``, mapping by mapping; weights of measures given as a whole replace others."""
     for key, value in change.items():
         if isinstance(value, dict) and isinstance(base.get(key), Mapping):
             base[key] = dict(base[key])
