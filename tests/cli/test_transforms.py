@@ -15,7 +15,7 @@ from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Transform
 from torchdeform.core.warp import invert
 from torchdeform.io import read_displacement, read_image, write_displacement, write_image
-from torchdeform.io.labels import read_labels
+from torchdeform.io.images import read_labels
 from torchdeform.io.points import Points, read_points, write_points
 from torchdeform.io.transforms import read_transform, write_transform
 

@@ -15,8 +15,7 @@ from torchdeform.core.interpolation import COPYING, MODES
 from torchdeform.core.transform import Transform
 from torchdeform.errors import InputError, require_choice
 from torchdeform.io.files import require_writable, suffix
-from torchdeform.io.images import FORMATS, read_image, read_optional, write_image
-from torchdeform.io.labels import read_labels, write_labels
+from torchdeform.io.images import FORMATS, read_image, read_labels, read_optional, write_image, write_labels
 from torchdeform.io.points import read_points, require_points_file, write_points
 from torchdeform.io.transforms import read_transform, require_transform_file, write_transform
 

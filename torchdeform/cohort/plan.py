@@ -15,7 +15,7 @@ from torchdeform.cohort.schema import Cohort
 from torchdeform.errors import InputError, nearest_name
 from torchdeform.io import read_displacement, read_image
 from torchdeform.io.files import atomic_folder
-from torchdeform.io.learn2reg import write_voxel_displacement
+from torchdeform.io.transforms import write_voxel_displacement
 from torchdeform.pipeline.register import Outcome, PairFiles, register_files
 from torchdeform.registration.result import Callback
 from torchdeform.registration.settings import RegistrationSettings

@@ -21,8 +21,7 @@ from torchdeform.core.warp import compose
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.io import read_image, read_transform, write_image, write_transform
 from torchdeform.io.files import atomic_folder, require_writable
-from torchdeform.io.images import ending_like
-from torchdeform.io.labels import read_labels, write_labels
+from torchdeform.io.images import ending_like, read_labels, write_labels
 from torchdeform.pipeline.register import PairFiles, choose_device
 from torchdeform.registration.template import Lazy, Template, identity_map, make_template
 from torchdeform.report.figures import write_gallery

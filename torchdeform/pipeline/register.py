@@ -15,8 +15,7 @@ from torchdeform.core.transform import Transform
 from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.io import read_image, write_displacement, write_image, write_transform
 from torchdeform.io.files import atomic_folder, require_writable
-from torchdeform.io.images import ending_like, read_optional
-from torchdeform.io.labels import read_labels, write_labels
+from torchdeform.io.images import ending_like, read_labels, read_optional, write_labels
 from torchdeform.io.points import matched, read_points
 from torchdeform.metrics.evaluation import common_labels
 from torchdeform.pipeline.memory import available, fitting_grid, footprint, peak, readable
@@ -25,10 +24,9 @@ from torchdeform.registration.deformable import resample_result
 from torchdeform.registration.problem import Guidance
 from torchdeform.registration.result import Callback, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.report.command_lines import repeat_command
 from torchdeform.report.figures import write_overview
 from torchdeform.report.page import write_report
-from torchdeform.report.record import describe, write_json
+from torchdeform.report.record import describe, repeat_command, write_json
 from torchdeform.report.report_data import make_report_data
 
 DEVICES = ("auto", "cpu", "cuda")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from torchdeform.metrics.similarity import similarity_weights
-from torchdeform.report.command_lines import apply_commands
+from torchdeform.report.record import apply_commands
 from torchdeform.report.verdict import ends, number, value
 
 _LONG = 12  # a table with more rows is folded
