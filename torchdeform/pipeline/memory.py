@@ -162,7 +162,7 @@ def fitting_grid(grid: Grid, limit: int, channels: int, settings: RegistrationSe
     if limit < least:
         raise InputError(
             f"--memory {readable(limit, spaced=False)} is too little for a fixed image of "
-            f"{'×'.join(map(str, grid.shape[::-1]))}: give at least {readable(least, spaced=False)}, or resample it"
+            f"{grid.size_text}: give at least {readable(least, spaced=False)}, or resample it"
         )
     size, coarser = min(grid.spacing), grid
     while footprint(coarser, channels, settings) > limit and max(coarser.shape) > MIN_NODES:

@@ -218,7 +218,7 @@ def _fit_to_memory(
     grid = fitting_grid(fixed.grid, memory, channels, settings)
     if grid == fixed.grid:
         return fixed, ()
-    sizes = " instead of ".join("×".join(map(str, g.shape[::-1])) for g in (grid, fixed.grid))
+    sizes = f"{grid.size_text} instead of {fixed.grid.size_text}"
     note = f"to stay below {readable(memory)} of memory the finest level has {sizes} nodes"
     return replace(fixed, data=restrict(fixed.data, fixed.grid, grid), grid=grid), (note,)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchdeform.metrics.similarity import similarity_weights
+from torchdeform.metrics.similarity import measure_name
 from torchdeform.registration.result import RegistrationResult
 from torchdeform.report.planes import Plane
 
@@ -172,7 +172,7 @@ def draw_convergence(axes: "Axes", result: RegistrationResult, *, item: int = 0)
         axes.plot(range(start, start + len(values)), values, marker, label=size, linewidth=1.6, color=colour)
         start += max(len(values) - 1, 0)
     axes.set_xlabel("step", fontsize=9, color=INK)
-    axes.set_ylabel(measure_name(result), fontsize=9, color=INK)
+    axes.set_ylabel(measure_name(result.settings.similarity.measure), fontsize=9, color=INK)
     _plain(axes)
     if result.levels:
         axes.legend(fontsize=8, frameon=False, loc="best")
@@ -198,11 +198,6 @@ def draw_volumes(axes: "Axes", counts: Tensor, limit: float) -> None:
 def _plain(axes: "Axes") -> None:
     axes.tick_params(labelsize=8, colors=INK)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def measure_name(result: RegistrationResult) -> str:
-    """Return the name of the similarity, or of several."""
-    return " + ".join(similarity_weights(result.settings.similarity.measure))
 
 
 def tinted(first: Floats, second: Floats) -> Floats:

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, box_corners
 from torchdeform.core.warp import sample
+from torchdeform.metrics.similarity import measure_name
 from torchdeform.report.drawing import (
     INK,
     difference_scale,
@@ -23,7 +24,6 @@ from torchdeform.report.drawing import (
     draw_lines,
     draw_map,
     frame,
-    measure_name,
     new_figure,
     save_png,
     tinted,
@@ -64,7 +64,7 @@ def write_overview(path: Path, data: ReportData) -> None:
         axes.set_title(_title(title, result) if cuts is data.slices[0] else "", fontsize=10, color=INK)
     for axes in cells:  # the last one, in 2D
         draw_convergence(axes, result)
-        axes.set_title(f"{measure_name(result)} over the steps", fontsize=10, color=INK)
+        axes.set_title(f"{measure_name(result.settings.similarity.measure)} over the steps", fontsize=10, color=INK)
         axes.set_ylabel("")
         axes.set_box_aspect(shapes[0])
     figure.suptitle(_headline(result), fontsize=11, color=INK)
@@ -86,10 +86,10 @@ def _headline(result: "RegistrationResult") -> str:
     diagnosis = result.diagnosis
     before, after = result.similarity_before.item(), result.similarity_after.item()
     return (
-        f"{measure_name(result)} {before:.3g} → {after:.3g}     "
+        f"{measure_name(result.settings.similarity.measure)} {before:.3g} → {after:.3g}     "
         f"folds {int(diagnosis.folds.item())}     "
         f"determinant {diagnosis.det_min.item():.2g} to {diagnosis.det_max.item():.2g}     "
-        f"inverse error {result.inverse_error_mean.item():.2g} voxel"
+        f"inverse consistency {result.inverse_error_mean.item():.2g} voxel"
     )
 
 

@@ -5,15 +5,15 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from torchdeform.metrics.similarity import measure_name
 from torchdeform.report.drawing import (
     Scale,
     difference_scale,
     draw_convergence,
     draw_volumes,
     length_scale,
-    measure_name,
     rotation_scale,
     signed_scale,
     volume_scale,
@@ -33,9 +33,6 @@ from torchdeform.report.web_images import (
     grid_paths,
     image_strip,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _MARKS = {GOOD: "✓", DOUBTFUL: "!", BAD: "✗"}
@@ -222,17 +219,14 @@ def _curves(data: ReportData) -> list[dict[str, object]]:
     """Return the histogram of volumes and the curve of the similarity over the steps."""
     from markupsafe import Markup
 
-    def volumes(axes: "Axes") -> None:
-        draw_volumes(axes, data.volumes, data.limits["log_det"])
-
-    def convergence(axes: "Axes") -> None:
-        draw_convergence(axes, data.result)
-
-    curves = {
-        "Volumes": ("How often each change of volume occurs, over all voxels.", volumes),
-        "Convergence": (f"Similarity ({measure_name(data.result)}) over the steps, by level.", convergence),
-    }
+    limit, measure = data.limits["log_det"], measure_name(data.result.settings.similarity.measure)
+    about_volumes = "How often each change of volume occurs, over all voxels."
+    about_steps = f"Similarity ({measure}) over the steps, by level."
+    curves = (
+        ("Volumes", about_volumes, lambda axes: draw_volumes(axes, data.volumes, limit)),
+        ("Convergence", about_steps, lambda axes: draw_convergence(axes, data.result)),
+    )
     return [
         {"title": title, "caption": caption, "svg": Markup(curve(title, draw, *_CURVE_INCHES))}
-        for title, (caption, draw) in curves.items()
+        for title, caption, draw in curves
     ]

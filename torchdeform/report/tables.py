@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchdeform.metrics.similarity import similarity_weights
+from torchdeform.metrics.similarity import measure_name
 from torchdeform.report.record import apply_commands
 from torchdeform.report.verdict import ends, number, value
 
@@ -55,7 +55,6 @@ def file_name(place: Mapping[str, Any]) -> str:
 
 def tiles(record: Record) -> list[Tile]:
     """Return the most important figures."""
-    measure = " + ".join(similarity_weights(record["similarity"]))
     frames = {2: 4, 3: 10}[len(record["fixed"]["size"])]
     low, high = number(record["determinant_min"]), number(record["determinant_max"])
     return [
@@ -65,7 +64,7 @@ def tiles(record: Record) -> list[Tile]:
             f"voxels where one of the {frames} one-sided determinants is not positive",
         ),
         Tile(
-            f"Similarity ({measure})",
+            f"Similarity ({measure_name(record['similarity'])})",
             f"{number(record['similarity_before'])} → {number(record['similarity_after'])}",
             "before → after the deformation; higher is better",
         ),
