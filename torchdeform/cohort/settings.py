@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from string import Template
 from typing import Annotated, Literal, Self
@@ -184,9 +185,4 @@ class TemplateSettings(Strict):
     @property
     def averaging(self) -> AveragingSettings:
         """The settings for the averages of a round."""
-        return AveragingSettings(
-            pose=self.pose,
-            match_intensities=self.match_intensities,
-            corrections=self.corrections,
-            tolerance=self.tolerance,
-        )
+        return AveragingSettings(**{field.name: getattr(self, field.name) for field in fields(AveragingSettings)})

@@ -60,6 +60,10 @@ class PairFiles:
     fixed_labels: Path | None = None
     moving_labels: Path | None = None
 
+    def given(self) -> dict[str, Path]:
+        """Return the files that are given, and the folder ``out``, by their names here."""
+        return {field.name: path for field in fields(self) if (path := getattr(self, field.name)) is not None}
+
     def require_pairs(self) -> None:
         """Raise `InputError` if points or labels are given for one image only."""
         for what in ("points", "labels"):
@@ -250,7 +254,7 @@ def _write_results(files: PairFiles, inputs: Inputs, result: RegistrationResult,
 
 def _record(files: PairFiles, inputs: Inputs, result: RegistrationResult, run: _Run) -> dict[str, Any]:
     """Return the record of a result, with the files and the figures of the run."""
-    given = {f.name: str(path) for f in fields(files) if (path := getattr(files, f.name)) is not None}
+    given = {name: str(path) for name, path in files.given().items()}
     device = result.displacement.device.type
     return describe(result, inputs.fixed, inputs.moving) | {
         "inputs": given,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -93,18 +94,12 @@ def _headline(result: "RegistrationResult") -> str:
     )
 
 
-def _draw_image(name: str) -> Draw:
-    def draw(axes: "Axes", data: ReportData, cuts: Slices) -> None:
-        draw_image(axes, cuts.plane, cuts.fields[name][cuts.middle])
-
-    return draw
+def _draw_image(name: str, axes: "Axes", data: ReportData, cuts: Slices) -> None:
+    draw_image(axes, cuts.plane, cuts.fields[name][cuts.middle])
 
 
-def _draw_difference(name: str) -> Draw:
-    def draw(axes: "Axes", data: ReportData, cuts: Slices) -> None:
-        draw_map(axes, cuts.plane, cuts.fields[name][cuts.middle], difference_scale(data.limits[name]), bar=False)
-
-    return draw
+def _draw_difference(name: str, axes: "Axes", data: ReportData, cuts: Slices) -> None:
+    draw_map(axes, cuts.plane, cuts.fields[name][cuts.middle], difference_scale(data.limits[name]), bar=False)
 
 
 def _draw_grid(axes: "Axes", data: ReportData, cuts: Slices) -> None:
@@ -118,12 +113,12 @@ def _draw_volume(axes: "Axes", data: ReportData, cuts: Slices) -> None:
 
 
 _PANELS: dict[str, Draw] = {
-    "fixed": _draw_image("fixed"),
-    "moving": _draw_image("moving"),
-    "warped": _draw_image("warped"),
+    "fixed": partial(_draw_image, "fixed"),
+    "moving": partial(_draw_image, "moving"),
+    "warped": partial(_draw_image, "warped"),
     "deformed grid": _draw_grid,
-    "difference before": _draw_difference("before"),
-    "difference after": _draw_difference("after"),
+    "difference before": partial(_draw_difference, "before"),
+    "difference after": partial(_draw_difference, "after"),
     "volume: moving / fixed": _draw_volume,
 }
 
