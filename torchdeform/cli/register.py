@@ -5,8 +5,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from torchdeform.cli.options import (
     Device,
@@ -23,13 +21,13 @@ from torchdeform.cli.options import (
     print_json,
     table,
 )
+from torchdeform.cli.progress import StepProgress
 from torchdeform.io.files import stem
 from torchdeform.metrics.similarity import measure_name
 from torchdeform.pipeline.config import load_settings, parse_override, preset_names
 from torchdeform.pipeline.memory import parse_size
 from torchdeform.pipeline.register import REPORT, Outcome, PairFiles, register_files
 from torchdeform.registration.affine.settings import ALIGNMENTS
-from torchdeform.registration.result import Progress as Step
 
 Fixed = Annotated[
     Path,
@@ -101,7 +99,7 @@ def register(
         moving_labels=moving_labels,
     )
     limit = None if memory is None else parse_size(memory)
-    with _Bar(quiet) as bar:
+    with StepProgress(quiet) as bar:
         outcome = register_files(files, settings, device=device, memory=limit, callback=bar.show)
     if json:
         print_json({**outcome.record, "out": str(outcome.folder)})
@@ -130,41 +128,7 @@ def _measured(record: dict[str, Any]) -> dict[str, str]:
     """Return lines about labels and landmarks, if they were given."""
     lines = {}
     for key, name in (("dice_mean", "Dice"), ("landmark_error_mean", "landmark error")):
-        stages = [
-            stage for stage in ("before", "aligned", "after") if key in record.get("evaluation", {}).get(stage, {})
-        ]
-        if stages:
-            lines[name] = " -> ".join(f"{record['evaluation'][stage][key]:.4g}" for stage in stages)
+        figures = [f"{stage[key]:.4g}" for stage in record["evaluation"].values() if key in stage]
+        if figures:
+            lines[name] = " -> ".join(figures)
     return lines
-
-
-class _Bar:
-    """A progress bar on stderr, on a terminal only."""
-
-    def __init__(self, quiet: bool) -> None:
-        console = Console(stderr=True)
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[detail]}"),
-            TimeElapsedColumn(),
-        )
-        hidden = quiet or not console.is_terminal
-        self._progress = Progress(*columns, console=console, transient=True, disable=hidden)
-        self._task = self._progress.add_task("reading", total=1.0, detail="")
-
-    def __enter__(self) -> "_Bar":
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def show(self, step: Step) -> None:
-        """Show one step of the optimisation. Every level is the same share of the bar."""
-        done = (step.level + step.step / max(step.steps, 1)) / step.levels
-        size = "×".join(map(str, step.shape))
-        detail = f"step {step.step}, similarity {step.similarity.mean().item():.4g}"
-        self._progress.update(
-            self._task, completed=done, description=f"level {step.level + 1}/{step.levels} {size}", detail=detail
-        )

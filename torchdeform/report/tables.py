@@ -118,7 +118,11 @@ def _labels(record: Record) -> Table | None:
         return None
     after = stages["after"]["dice"]
     rows = [
-        [label, *(number(m["dice"][label]) for m in stages.values()), *_far(stages, label)]
+        [
+            label,
+            *(number(m["dice"][label]) for m in stages.values()),
+            *(number(stages[end]["hausdorff_95"][label]) for end in ("before", "after")),
+        ]
         for label in sorted(after, key=lambda label: value(after[label]) if math.isfinite(value(after[label])) else 2.0)
     ]
     means = " → ".join(f"{number(m['dice_mean'])} {stage}" for stage, m in stages.items())
@@ -128,10 +132,6 @@ def _labels(record: Record) -> Table | None:
         "unit of the files."
     )
     return Table("Labels", [_foldable(head, rows, f"All {len(rows)} labels")], summary)
-
-
-def _far(stages: Mapping[str, Mapping[str, Any]], label: str) -> list[str]:
-    return [number(stages[stage]["hausdorff_95"][label]) for stage in ("before", "after")]
 
 
 def _landmarks(record: Record) -> Table | None:
