@@ -18,6 +18,10 @@ from torchdeform.pipeline.config import parse_override
 from torchdeform.pipeline.register import PairFiles
 
 _FILES = tuple(field.name for field in fields(PairFiles) if field.name != "out")
+_COLUMNS = ("name", *_FILES)  # of a table
+_SETTING = "settings."
+_SEPARATORS = {".csv": ",", ".tsv": "\t"}
+_EMPTY = ("", "n/a")  # BIDS writes n/a where there is nothing
 
 
 def find_images(images: Images) -> list[FoundFile]:
@@ -174,12 +178,6 @@ def _listed(pair: Pair, where: str) -> PairSpec:
     files = {key: path for key in _FILES if (path := getattr(pair, key)) is not None}
     name = pair.name or pair_name(pair.fixed, pair.moving, {}, {})
     return PairSpec(name=name, files=files, where=where, settings=pair.settings)
-
-
-_SEPARATORS = {".csv": ",", ".tsv": "\t"}
-_COLUMNS = ("name", *_FILES)
-_SETTING = "settings."
-_EMPTY = ("", "n/a")  # BIDS writes n/a where there is nothing
 
 
 def table_pairs(path: Path) -> list[PairSpec]:

@@ -169,7 +169,7 @@ class EngineSettings(Strict):
 class TemplateSettings(Strict):
     """How a template is made."""
 
-    rounds: Annotated[int, Field(ge=1)] = 3
+    rounds: Count = 3
     """How often all images are registered, each time to the template of the round before."""
     reference: Place | None = None
     """Image that the first round registers to; the template gets its grid. By default the first of images."""
@@ -177,7 +177,7 @@ class TemplateSettings(Strict):
     """Position and orientation of the template: those of the reference, or the mean of all images."""
     match_intensities: bool = AveragingSettings.match_intensities
     """Scale all images to one mean and one standard deviation before they are averaged."""
-    corrections: Annotated[int, Field(ge=1)] = AveragingSettings.corrections
+    corrections: Count = AveragingSettings.corrections
     """Corrections in a round at most that bring the mean of the maps from the template to the identity."""
     tolerance: Annotated[float, Field(ge=0)] = AveragingSettings.tolerance
     """Largest displacement of that mean, in voxels, that counts as the identity."""

@@ -18,6 +18,8 @@ COLUMNS = ("name", "status", *FIGURES, "seconds", "peak_memory_mb", "gpu_memory_
 FAILURE_COLUMNS = ("name", "sentence", "log")
 
 _LOGS = "logs"
+_TEMPLATES = Path(__file__).parent / "templates"
+_SHOWN = ("report.html", "overview.png")  # the first that exists is linked from the name of a pair
 
 Row = Mapping[str, str | float]
 
@@ -95,10 +97,6 @@ def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> Non
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-
-
-_TEMPLATES = Path(__file__).parent / "templates"
-_SHOWN = ("report.html", "overview.png")  # the first that exists is linked from the name of a pair
 
 
 def write_page(path: Path, rows: Sequence[Row], failures: Iterable[Row]) -> None:

@@ -80,11 +80,6 @@ class Round:
     subjects: tuple[Subject, ...]
     key: str
 
-    @staticmethod
-    def pair(folder: Path, name: str) -> Path:
-        """Return the folder of an image's registration."""
-        return folder / _PAIRS / name
-
 
 def build(cohort: Cohort, *, retry_failed: bool = False, report: Listener | None = None) -> Built:
     """Make the template of a cohort's images; work of an earlier run is not repeated.
@@ -152,9 +147,8 @@ def _register(
 
 
 def _job(cohort: Cohort, folder: Path, reference: Path, subject: Subject) -> Job:
-    files = PairFiles(
-        fixed=reference, moving=subject.image, moving_mask=subject.mask, out=Round.pair(folder, subject.name)
-    )
+    out = folder / _PAIRS / subject.name
+    files = PairFiles(fixed=reference, moving=subject.image, moving_mask=subject.mask, out=out)
     return Job(name=subject.name, files=files, settings=cohort.resolve(), device=cohort.device, memory=cohort.memory)
 
 
@@ -199,7 +193,7 @@ def _read_map(current: Round, subject: Subject, reference: Image) -> Transform:
     """Return the map from the reference to an image, with its inverse."""
     if subject.image == current.reference:
         return identity_map(reference)
-    pair = Round.pair(current.folder, subject.name)
+    pair = current.folder / _PAIRS / subject.name
     forward, back = (read_transform(pair / name).stages for name in (_TRANSFORM, _INVERSE))
     fields = [stage.field for stage in (forward[0], back[-1]) if isinstance(stage, Displacement)]
     known = Displacement(*(replace(field, data=field.data.float()) for field in fields))

@@ -27,7 +27,6 @@ _STATUS = Path("/proc/self/status")
 # Limit and use of a control group, by its version's file names.
 _LIMITS = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
 
-
 # Measured by ``scripts/benchmarks/memory.py``: bytes of a process that has imported everything; and per node of the
 # fixed grid, whatever the similarity, by dimension. To these come those of `Measure.memory` per node and channel.
 _PROCESS_BYTES = 4.5e8

@@ -42,6 +42,11 @@ if TYPE_CHECKING:
 _SHEET = {2: (2, 4), 3: (3, 7)}  # rows and columns of panels
 _PANEL_INCHES = {2: 3.2, 3: 2.3}
 _GRID_LINES = {2: 36, 3: 24}
+_GALLERY_INCHES = {2: 3.2, 3: 2.2}
+_OUTLINES = ("#0b5fa5", "#b34700")
+_OVERLAY_INCHES = 3.0
+_PIXELS = 400  # along the longer side of an overlay
+_FARTHEST = 3.0  # width of an overlay at most, in widths of the fixed image
 
 Draw = Callable[["Axes", ReportData, Slices], None]
 
@@ -123,9 +128,6 @@ _PANELS: dict[str, Draw] = {
 }
 
 
-_GALLERY_INCHES = {2: 3.2, 3: 2.2}  # width of a panel
-
-
 def write_gallery(path: Path, images: Mapping[str, Image]) -> None:
     """Draw images side by side as a PNG, each on its own scale of grey values; in 3D their three middle planes.
 
@@ -143,12 +145,6 @@ def write_gallery(path: Path, images: Mapping[str, Image]) -> None:
             draw_image(cells[row, column], plane, plane.cut(to_unit(values, values), [plane.middle])[0])
         cells[0, column].set_title(title, fontsize=10, color=INK)
     save_png(figure, path)
-
-
-_OUTLINES = ("#0b5fa5", "#b34700")
-_OVERLAY_INCHES = 3.0
-_PIXELS = 400  # along the longer side of a picture
-_FARTHEST = 3.0  # width of the picture at most, in widths of the fixed image
 
 
 @dataclass(frozen=True)

@@ -106,14 +106,14 @@ def tables(record: Record) -> list[Table]:
     return [table for table in found if table is not None]
 
 
-def _measures(record: Record) -> dict[str, Mapping[str, Any]]:
-    """Return the measures of labels and landmarks by stage, as far as known."""
+def _measures(record: Record, key: str) -> dict[str, Mapping[str, Any]]:
+    """Return the measures of labels and landmarks by stage, of the stages that have the key."""
     found = record.get("evaluation", {})
-    return {stage: found[stage] for stage in _STAGES if stage in found}
+    return {stage: found[stage] for stage in _STAGES if key in found.get(stage, {})}
 
 
 def _labels(record: Record) -> Table | None:
-    stages = {stage: m for stage, m in _measures(record).items() if "dice" in m}
+    stages = _measures(record, "dice")
     if not stages:
         return None
     after = stages["after"]["dice"]
@@ -135,7 +135,7 @@ def _labels(record: Record) -> Table | None:
 
 
 def _landmarks(record: Record) -> Table | None:
-    stages = {stage: m for stage, m in _measures(record).items() if "landmark_errors" in m}
+    stages = _measures(record, "landmark_errors")
     if not stages:
         return None
     head = ["distance in mm", *stages]
