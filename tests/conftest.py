@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 from torch import Tensor
 
 from torchdeform.core.diagnostics import diagnose
@@ -17,6 +18,14 @@ from torchdeform.core.warp import invert
 from torchdeform.registration.problem import Guidance
 from torchdeform.registration.result import Callback, LevelRecord, Progress, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
+
+# What tells programs that they are seen in a terminal, or not; typer looks when it is imported.
+for _name in ("FORCE_COLOR", "CLICOLOR_FORCE", "PY_COLORS", "GITHUB_ACTIONS", "NO_COLOR", "TTY_COMPATIBLE"):
+    os.environ.pop(_name, None)
+
+# How long an example takes says nothing about what it tests, and the folder of the tests may not be writable.
+settings.register_profile("any machine", database=None, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any machine")
 
 if os.environ.get("PYTEST_XDIST_WORKER"):
     torch.set_num_threads(1)
@@ -30,6 +39,12 @@ _TILTED = {
         (0.289629477625, 0.956425085849, -0.036957013525),
         (-0.198669330795, 0.097843395007, 0.975170327202)),
 }  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    """Random numbers are the same on every machine and in every order of the tests."""
+    torch.manual_seed(0)
 
 
 @pytest.fixture(autouse=True)

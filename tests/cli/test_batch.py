@@ -19,7 +19,7 @@ COHORT = """\
 out: out
 pairs: {{list: [{pairs}]}}
 preset: fast
-settings: {{align: none, similarity: ssd, length: 8, steps: [2]}}
+settings: {{align: none, similarity: ssd, metric: {{length_scale: 8}}, optimiser: {{steps: [2]}}}}
 device: cpu
 engine: {{workers: 2, threads: 1}}
 """

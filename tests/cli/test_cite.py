@@ -15,10 +15,10 @@ def test_the_verb_reads_settings_and_records(tmp_path, capsys):
     direct = capsys.readouterr().out
     assert direct.strip() == bibtex(load_settings(overrides={"similarity": "mind"}))
     record = {"settings": {**asdict(load_settings(overrides={"similarity": "mind"})), "of_an_older_version": 1}}
-    (tmp_path / "result.json").write_text(json.dumps(record))
+    (tmp_path / "result.json").write_text(json.dumps(record), encoding="utf-8")
     assert torchdeform(["cite", str(tmp_path / "result.json")]) == 0
     assert capsys.readouterr().out == direct
-    (tmp_path / "my.yaml").write_text("similarity: mind\n")
+    (tmp_path / "my.yaml").write_text("similarity: mind\n", encoding="utf-8")
     assert torchdeform(["cite", "--config", str(tmp_path / "my.yaml")]) == 0
     assert capsys.readouterr().out == direct
 
@@ -34,7 +34,7 @@ def test_the_verb_reads_settings_and_records(tmp_path, capsys):
 )
 def test_wrong_records_are_one_sentence(tmp_path, capsys, text, message):
     if text is not None:
-        (tmp_path / "result.json").write_text(text)
+        (tmp_path / "result.json").write_text(text, encoding="utf-8")
     assert torchdeform(["cite", str(tmp_path / "result.json")]) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -43,6 +43,6 @@ def test_wrong_records_are_one_sentence(tmp_path, capsys, text, message):
 
 
 def test_a_record_and_settings_do_not_go_together(tmp_path, capsys):
-    (tmp_path / "result.json").write_text('{"settings": {}}')
+    (tmp_path / "result.json").write_text('{"settings": {}}', encoding="utf-8")
     assert torchdeform(["cite", str(tmp_path / "result.json"), "--preset", "fast"]) == 2
     assert "leave out --preset" in capsys.readouterr().err

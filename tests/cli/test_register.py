@@ -80,12 +80,15 @@ def test_volumes_end_to_end(folder, engine):
 
 
 def test_record_says_what_ran(folder, engine):
-    (folder / "my.yaml").write_text("steps: [4, 2]\n", encoding="utf-8")
+    (folder / "my.yaml").write_text("optimiser: {steps: [4, 2]}\n", encoding="utf-8")
     assert (
-        torchdeform(["register", "fixed.png", "moving.png", "--config", "my.yaml", "--set", "window=7", "--quiet"]) == 0
+        torchdeform(
+            ["register", "fixed.png", "moving.png", "--config", "my.yaml", "--set", "similarity.window=7", "--quiet"]
+        )
+        == 0
     )
     record = json.loads((folder / "moving" / "result.json").read_text(encoding="utf-8"))
-    assert (record["settings"]["steps"], record["settings"]["window"]) == ([4, 2], 7)
+    assert (record["settings"]["optimiser"]["steps"], record["settings"]["similarity"]["window"]) == ([4, 2], 7)
     assert set(record["seconds"]) == {"read", "optimise", "write", "draw"}
     assert sorted(record["files"]) == _names(folder / "moving")
     assert record["moving"]["path"] == "moving.png"
@@ -99,11 +102,11 @@ def test_quiet_is_quiet(folder, engine, capfd):
 
 def test_a_second_run_replaces_its_own_files_only(folder, engine):
     assert main(["fixed.png", "moving.png", "--out", "out", "--quiet"]) == 0
-    (folder / "out" / "notes.txt").write_text("mine")
+    (folder / "out" / "notes.txt").write_text("mine", encoding="utf-8")
     write_image(read_image("moving.png"), "moving.tif")
     assert main(["fixed.png", "moving.tif", "--out", "out", "--quiet"]) == 0
     assert _names(folder / "out") == sorted([*RESULTS, "warped.tif", "notes.txt"])
-    assert (folder / "out" / "notes.txt").read_text() == "mine"
+    assert (folder / "out" / "notes.txt").read_text(encoding="utf-8") == "mine"
 
 
 def test_a_failure_keeps_the_earlier_results(folder, engine, capsys, monkeypatch):
@@ -183,7 +186,7 @@ def _channels():
         (_nan, ["bad.nii.gz", "moving.png"], "bad.nii.gz has pixels that are NaN"),
         (_elsewhere, ["fixed.png", "bad.mha", "--align", "none"], "overlap"),
         (_channels, ["fixed.png", "bad.mha"], "bad.mha 5, which do not correspond"),
-        (None, ["fixed.png", "moving.png", "--set", "windw=5"], "did you mean 'window'?"),
+        (None, ["fixed.png", "moving.png", "--set", "windw=5"], "did you mean 'similarity.window'?"),
         (None, ["fixed.png", "moving.png", "--set", "window"], "--set needs key=value"),
         (None, ["fixed.png", "moving.png", "--preset", "fst"], "did you mean 'fast'?"),
         (None, ["fixed.png", "moving.png", "--config", "no.yaml"], "no.yaml cannot be read"),
@@ -236,7 +239,12 @@ def test_help_names_every_option(capsys):
 
 
 def test_progress_is_shown_on_a_terminal_only(folder, engine, capsys, monkeypatch):
-    monkeypatch.setenv("FORCE_COLOR", "1")  # makes rich believe in a terminal
+    for name, value in {
+        "FORCE_COLOR": "1",
+        "TERM": "xterm",
+        "COLUMNS": "100",
+    }.items():  # what rich takes for a terminal
+        monkeypatch.setenv(name, value)
     assert main(["fixed.png", "moving.png"]) == 0
     assert "level 2/2" in capsys.readouterr().err
 
@@ -255,7 +263,20 @@ def test_the_real_engine(folder, make_image, make_displacement):
     write_image(fixed, "one.nrrd")
     write_image(replace(fixed, data=deformed), "two.nrrd")
     assert (
-        main(["one.nrrd", "two.nrrd", "--set", "steps=[20, 10]", "--align", "none", "--device", "cpu", "--quiet"]) == 0
+        main(
+            [
+                "one.nrrd",
+                "two.nrrd",
+                "--set",
+                "optimiser.steps=[20, 10]",
+                "--align",
+                "none",
+                "--device",
+                "cpu",
+                "--quiet",
+            ]
+        )
+        == 0
     )
     record = json.loads((folder / "two" / "result.json").read_text(encoding="utf-8"))
     assert record["folds"] == 0

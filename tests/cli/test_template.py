@@ -18,6 +18,6 @@ def test_a_broken_image_is_left_out_and_the_shell_says_so(tmp_path, capsys):
     assert "3, 1 left out" in out
     assert "without sub-2" in err
     assert re.search(r"round 1 of 1.*sub-2 failed: .*sub-2\.nii\.gz", err)
-    record = json.loads((tmp_path / "out" / "result.json").read_text())
+    record = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
     assert record["left_out"].keys() == {"sub-2"}
     assert record["images"].keys() == {"sub-0", "sub-1", "sub-3"}

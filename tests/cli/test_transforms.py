@@ -138,7 +138,7 @@ def test_points_go_to_moving_and_back(folder, ending):
 
 def test_points_in_voxels(folder):
     dim = read_image("fixed.nrrd").grid.dim
-    (folder / "voxels.csv").write_text(f"{','.join('ijk'[:dim])}\n{','.join('345'[:dim])}\n")
+    (folder / "voxels.csv").write_text(f"{','.join('ijk'[:dim])}\n{','.join('345'[:dim])}\n", encoding="utf-8")
     assert run("points", "u.nrrd", "voxels.csv", "--out", "out.csv") == 2
     assert run("points", "u.nrrd", "voxels.csv", "--out", "out.csv", "--reference", "fixed.nrrd") == 0
     index, u = (3, 4, 5)[:dim], read_displacement("u.nrrd")
@@ -254,7 +254,7 @@ def test_wrong_input_is_one_sentence_and_leaves_nothing(volumes, capsys, argumen
     )
     write_image(replace(read_image("fixed.nrrd"), origin=(900.0, 0.0, 0.0)), "away.nrrd")
     write_transform(Transform((Affine.identity(2),)), "flat.mat")
-    (volumes / "flat.csv").write_text("x,y\n1,2\n")
+    (volumes / "flat.csv").write_text("x,y\n1,2\n", encoding="utf-8")
     before = sorted(p.name for p in volumes.iterdir())
     assert run(*arguments) == 2
     out, err = capsys.readouterr()

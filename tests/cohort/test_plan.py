@@ -20,22 +20,24 @@ _IMAGES = [f"sub-{subject}_ses-{session}.png" for subject in ("a", "b") for sess
 
 def test_jobs_have_everything_resolved(touch, cohort_of, tmp_path):
     touch(_IMAGES)
-    work = plan(cohort_of(f"preset: fast\nsettings: {{window: 5}}\ndevice: cpu\nmemory: 1GB\n{_PATTERN}"))
+    work = plan(cohort_of(f"preset: fast\nsettings: {{similarity.window: 5}}\ndevice: cpu\nmemory: 1GB\n{_PATTERN}"))
     job = work.jobs[0]
     assert (len(work.jobs), work.problems, work.out) == (2, (), tmp_path / "results")
     assert job.files.out == tmp_path / "results" / "sub-a" / "sub-a_from-ses2_to-ses1"
-    assert job.settings == load_settings("fast", overrides={"window": 5})
+    assert job.settings == load_settings("fast", overrides={"similarity.window": 5})
     assert (job.device, job.memory, job.submission, job.voxels) == ("cpu", 10**9, None, False)
     assert job.files.fixed.is_absolute()
 
 
 def test_settings_of_a_pair_are_its_own(touch, cohort_of, tmp_path):
     touch(["a.png", "b.png"])
-    (tmp_path / "t.csv").write_text("fixed,moving,settings.window\na.png,b.png,7\nb.png,a.png,\n", encoding="utf-8")
-    one, other = plan(cohort_of("settings: {window: 5}\npairs: {table: {file: t.csv}}\n")).jobs
-    assert (one.settings.window, other.settings.window) == (7, 5)
+    (tmp_path / "t.csv").write_text(
+        "fixed,moving,settings.similarity.window\na.png,b.png,7\nb.png,a.png,\n", encoding="utf-8"
+    )
+    one, other = plan(cohort_of("settings: {similarity.window: 5}\npairs: {table: {file: t.csv}}\n")).jobs
+    assert (one.settings.similarity.window, other.settings.similarity.window) == (7, 5)
     (tmp_path / "t.csv").write_text("fixed,moving,settings.windw\na.png,b.png,7\n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"t.csv line 2: .*no setting 'windw'; did you mean 'window'"):
+    with pytest.raises(InputError, match=r"t.csv line 2: .*no setting 'windw'; did you mean 'similarity.window'"):
         plan(cohort_of("pairs: {table: {file: t.csv}}\n"))
 
 
@@ -113,7 +115,9 @@ def test_jobs_of_the_challenge_write_its_files(cohort_of, make_image, tmp_path):
         "registration_val": [{"fixed": "./Set_0001_0000.nii.gz", "moving": "./Set_0002_0000.nii.gz"}],
     }
     (tmp_path / "d.json").write_text(json.dumps(content), encoding="utf-8")
-    (job,) = plan(cohort_of("layout: learn2reg\nsettings: {steps: [1]}\npairs: {learn2reg: {file: d.json}}\n")).jobs
+    (job,) = plan(
+        cohort_of("layout: learn2reg\nsettings: {optimiser: {steps: [1]}}\npairs: {learn2reg: {file: d.json}}\n")
+    ).jobs
     assert job.submission == tmp_path / "results" / "submission" / "disp_0001_0002.nii.gz"
     assert job.voxels
     outcome = register_job(job)

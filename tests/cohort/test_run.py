@@ -45,7 +45,7 @@ class Feigned:
 
 def succeed(task: Task) -> PairReport:
     task.job.files.out.mkdir(parents=True, exist_ok=True)
-    (task.job.files.out / "warped.png").write_text(str(task.job.settings.window), encoding="ascii")
+    (task.job.files.out / "warped.png").write_text(str(task.job.settings.similarity.window), encoding="ascii")
     return PairReport(DONE, seconds=0.1, figures={"folds": 0}, files=("warped.png",))
 
 

@@ -1,6 +1,8 @@
 """The cohort file: what it means, what is refused and where, and what editors are told."""
 
+import errno
 import json
+import os
 
 import pytest
 
@@ -34,15 +36,17 @@ def test_what_a_variable_holds_is_no_pattern(touch, cohort_of, monkeypatch):
 
 
 def test_settings_come_from_the_preset_the_cohort_and_the_pair(cohort_of):
-    cohort = cohort_of(f"preset: fast\nsettings: {{window: 7, similarity: {{mi: 1}}}}\n{_LIST}")
-    assert cohort.resolve() == load_settings("fast", overrides={"window": 7, "similarity": {"mi": 1}})
+    cohort = cohort_of(f"preset: fast\nsettings: {{similarity.window: 7, similarity: {{mi: 1}}}}\n{_LIST}")
+    assert cohort.resolve() == load_settings("fast", overrides={"similarity.window": 7, "similarity": {"mi": 1}})
     resolved = cohort.resolve({"similarity": {"ngf": 2}})
-    assert (resolved.window, resolved.similarity) == (7, {"ngf": 2})
+    assert (resolved.similarity.window, resolved.similarity.measure) == (7, {"ngf": 2})
 
 
 def test_resolved_file_says_the_same(cohort_of, tmp_path, monkeypatch):
     monkeypatch.setenv("IMAGES", "/da$ta/{x}")
-    cohort = cohort_of(f"preset: smooth\nmemory: 4GB\nsettings: {{steps: [3]}}\nimages: {{files: $IMAGES/*}}\n{_LIST}")
+    cohort = cohort_of(
+        f"preset: smooth\nmemory: 4GB\nsettings: {{optimiser: {{steps: [3]}}}}\nimages: {{files: $IMAGES/*}}\n{_LIST}"
+    )
     again = tmp_path / "elsewhere" / "again.yaml"
     again.parent.mkdir()
     again.write_text(cohort.to_yaml(), encoding="utf-8")
@@ -59,9 +63,17 @@ def test_resolved_file_says_the_same(cohort_of, tmp_path, monkeypatch):
         (_PATTERN.replace("pairing", "pairng"), 5, "there is no key 'pairs.pattern.pairng'; did you mean 'pairing'?"),
         (_LIST + "      fixd: x\n", 6, r"there is no key 'pairs.list\[0\].fixd'; did you mean 'fixed'?"),
         (_PATTERN.replace("all", "al"), 5, "pairs.pattern.pairing: 'al'.*did you mean 'all'?"),
-        ("settings:\n  window: 5\n  similarty: mi\n", 4, "settings: there is no setting 'similarty'; did you mean"),
-        ("settings:\n  window: 4\n", 3, "settings: window must be an odd number"),
-        (_LIST + "      settings:\n        window: x\n", 7, r"pairs.list\[0\].settings: window = 'x'"),
+        (
+            "settings:\n  symmetric: true\n  similarty: mi\n",
+            4,
+            "settings: there is no setting 'similarty'; did you mean",
+        ),
+        ("settings:\n  similarity.window: 4\n", 3, "settings: similarity.window must be an odd number"),
+        (
+            _LIST + "      settings:\n        similarity.window: x\n",
+            7,
+            r"pairs.list\[0\].settings: similarity.window = 'x'",
+        ),
         ("preset: fst\n", 2, "preset must be one of .*; did you mean 'fast'?"),
         ("memory: 4 apples\n", 2, "memory: a size of memory is a number with a unit"),
         ("memory: 0\n", 2, "memory: 0"),
@@ -104,7 +116,7 @@ def test_out_is_needed(tmp_path):
 
 
 def test_files_that_are_no_cohort(tmp_path):
-    with pytest.raises(InputError, match="No such file"):
+    with pytest.raises(InputError, match=os.strerror(errno.ENOENT)):
         read_cohort(tmp_path / "no.yaml")
     (tmp_path / "list.yaml").write_text("- a\n", encoding="utf-8")
     with pytest.raises(InputError, match="must hold 'key: value' lines"):

@@ -29,7 +29,7 @@ def ages(folder: Path) -> dict[Path, int]:
 
 
 def test_everything_is_written(built):
-    record = json.loads((built.folder / "result.json").read_text())
+    record = json.loads((built.folder / "result.json").read_text(encoding="utf-8"))
     assert record["images"].keys() == {"sub-0", "sub-1", "sub-2"}
     assert record["left_out"] == {}
     assert all((built.folder / name).is_file() for name in record["files"])

@@ -47,5 +47,5 @@ def test_a_large_change_of_shape_is_matched_to_the_pixel(data_folder):
 def test_a_volume(data_folder):
     preset, cases = SETS["mouse_brain_3d"]
     case = next(cases(data_folder / "mouse_brain_3d"))
-    found = outcome(case, preset, steps=[60, 20, 5])  # the finest level costs most and changes little
+    found = outcome(case, preset, **{"optimiser.steps": [60, 20, 5]})  # the finest level costs most and changes little
     assert found["dice"] > found["before"] + 0.5

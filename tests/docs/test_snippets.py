@@ -72,7 +72,9 @@ def test_yaml_snippets_are_yaml(page):
     """Those of clusters are pieces of one, which tests/batch reads."""
     for snippet in blocks(page, "yaml"):
         included = re.findall(r'--8<-- "(.*)"', snippet)
-        assert isinstance(yaml.safe_load((ROOT / included[0]).read_text() if included else snippet), dict)
+        assert isinstance(
+            yaml.safe_load((ROOT / included[0]).read_text(encoding="utf-8") if included else snippet), dict
+        )
 
 
 @pytest.fixture

@@ -106,8 +106,3 @@ class Brute:
 def brute() -> type[Brute]:
     """The brute-force assembly: ``brute(shape, spacing, points=3)``."""
     return Brute
-
-
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)

@@ -27,7 +27,8 @@ out: out
 images:
   files: images/sub-{{subject}}.nii.gz
   labels: images/labels-{{subject}}.nii.gz
-settings: {{align: none, steps: [30, 10], length: 12, window: 5}}
+settings:
+  {{align: none, optimiser: {{steps: [30, 10]}}, metric: {{length_scale: 12}}, similarity: {{window: 5}}}}
 template: {{rounds: {rounds}, {more}}}
 engine: {{workers: 1, threads: 1}}
 """

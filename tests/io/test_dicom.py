@@ -141,7 +141,7 @@ def test_several_series_are_listed_and_one_file_chooses(tmp_path):
 
 def test_other_files_in_the_folder_do_not_matter(tmp_path):
     folder = write_series(tmp_path / "scan")
-    (folder / "notes.txt").write_text("hello")
+    (folder / "notes.txt").write_text("hello", encoding="utf-8")
     (folder / "report.pdf").write_bytes(b"%PDF" + bytes(500))
     directory = b"\0" * 128 + b"DICM\x02\0\x02\0UI\x14\x001.2.840.10008.1.3.10\0" + bytes(200)
     (folder / "DICOMDIR").write_bytes(directory)
@@ -190,7 +190,7 @@ def test_uneven_slices_are_named(tmp_path):
 
 def test_a_folder_without_dicom_says_what_it_has(tmp_path):
     (tmp_path / "inner").mkdir()
-    (tmp_path / "a.txt").write_text("hello")
+    (tmp_path / "a.txt").write_text("hello", encoding="utf-8")
     with pytest.raises(InputError, match=r"is a folder without DICOM images \(it has the folders inner\)"):
         read_image(tmp_path)
 

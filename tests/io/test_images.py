@@ -210,7 +210,7 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path, make_image, name, channe
 
 
 def test_no_place_to_write_is_said(tmp_path, make_image):
-    (tmp_path / "file").write_text("")
+    (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(InputError, match="is not a folder"):
         write_image(make_image((6, 7)), tmp_path / "file" / "a.mha")
 

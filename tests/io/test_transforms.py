@@ -137,7 +137,7 @@ def test_wrong_fields_are_refused(tmp_path, make_image, make_displacement):
     write_image(fixed, tmp_path / "image.mha")
     with pytest.raises(InputError, match="no displacement field"):
         read_displacement(tmp_path / "image.mha")
-    (tmp_path / "text.txt").write_text("hello")
+    (tmp_path / "text.txt").write_text("hello", encoding="utf-8")
     with pytest.raises(InputError, match="cannot be read"):
         read_displacement(tmp_path / "text.txt")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["image.mha", "text.txt"]
@@ -335,11 +335,13 @@ def test_other_transforms_are_refused(tmp_path):
     with pytest.raises(InputError, match="holds a BSplineTransform"):
         read_transform(tmp_path / "spline.tfm")
     flat = "#Insight Transform File V1.0\n#Transform 0\nTransform: AffineTransform_double_2_2\n"
-    (tmp_path / "flat.tfm").write_text(f"{flat}Parameters: 0 0 0 0 1 2\nFixedParameters: 0 0\n")
+    (tmp_path / "flat.tfm").write_text(f"{flat}Parameters: 0 0 0 0 1 2\nFixedParameters: 0 0\n", encoding="utf-8")
     with pytest.raises(InputError, match="singular"):
         read_transform(tmp_path / "flat.tfm")
     one = f"{flat}Parameters: 1 0 0 1 1 2\nFixedParameters: 0 0\n"
-    (tmp_path / "two.tfm").write_text(one + one.partition("\n")[2].replace("#Transform 0", "#Transform 1"))
+    (tmp_path / "two.tfm").write_text(
+        one + one.partition("\n")[2].replace("#Transform 0", "#Transform 1"), encoding="utf-8"
+    )
     with pytest.raises(InputError, match="several transforms"):
         read_transform(tmp_path / "two.tfm")
 

@@ -136,7 +136,9 @@ def test_what_reading_and_writing_take_is_the_least():
 @linux
 def test_what_is_free_here():
     total = next(
-        int(line.split()[1]) * 1024 for line in Path("/proc/meminfo").read_text().splitlines() if "Total" in line
+        int(line.split()[1]) * 1024
+        for line in Path("/proc/meminfo").read_text(encoding="utf-8").splitlines()
+        if "Total" in line
     )
     free = available()
     assert free is not None
@@ -149,19 +151,19 @@ def machine(tmp_path, monkeypatch):
     monkeypatch.setattr(memory, "_MEMINFO", tmp_path / "meminfo")
     monkeypatch.setattr(memory, "_PROCESS", tmp_path / "process")
     monkeypatch.setattr(memory, "_GROUPS", tmp_path / "groups")
-    (tmp_path / "meminfo").write_text("MemTotal: 16000000 kB\nMemAvailable: 8000000 kB\n")
+    (tmp_path / "meminfo").write_text("MemTotal: 16000000 kB\nMemAvailable: 8000000 kB\n", encoding="utf-8")
     return tmp_path
 
 
 def group(folder: Path, **files: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
-        (folder / name.replace("_", ".", 1)).write_text(text + "\n")
+        (folder / name.replace("_", ".", 1)).write_text(text + "\n", encoding="utf-8")
 
 
 def test_limits_of_control_groups(machine):
     assert available() == 8000000 * 1024
-    (machine / "process").write_text("0::/work/job\n")
+    (machine / "process").write_text("0::/work/job\n", encoding="utf-8")
     group(machine / "groups" / "work" / "job", memory_max="max", memory_current="100")
     assert available() == 8000000 * 1024
     group(machine / "groups" / "work", memory_max="3000000000", memory_current="1000000000")
@@ -171,7 +173,7 @@ def test_limits_of_control_groups(machine):
 
 
 def test_limits_of_the_first_version_of_control_groups(machine):
-    (machine / "process").write_text("9:cpu:/\n5:memory:/job\n")
+    (machine / "process").write_text("9:cpu:/\n5:memory:/job\n", encoding="utf-8")
     group(machine / "groups" / "memory" / "job", memory_limit_in_bytes="700", memory_usage_in_bytes="200")
     assert available() == 500
 

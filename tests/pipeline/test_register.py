@@ -41,7 +41,7 @@ def folder(request, tmp_path, monkeypatch):
 def test_what_is_written_is_what_was_measured(folder):
     options = ["--fixed-labels", "fixed_labels.nrrd", "--moving-labels", "moving_labels.nrrd", "--preset", "fast"]
     assert main(["fixed.nrrd", "moving.nrrd", *options, "--align", "translation", "--out", "out", "--quiet"]) == 0
-    record = json.loads((folder / "out" / "result.json").read_text())
+    record = json.loads((folder / "out" / "result.json").read_text(encoding="utf-8"))
     assert record["label_interpolation"] == "label"
     fixed, warped = read_labels("fixed_labels.nrrd").data, read_labels("out/warped_labels.nrrd")
     assert warped.pixel_type == "float32"
@@ -56,7 +56,7 @@ def test_what_is_written_is_what_was_measured(folder):
 
 def test_without_labels_nothing_is_said_of_them(folder):
     assert main(["fixed.nrrd", "moving.nrrd", "--preset", "fast", "--out", "out", "--quiet"]) == 0
-    assert json.loads((folder / "out" / "result.json").read_text())["label_interpolation"] is None
+    assert json.loads((folder / "out" / "result.json").read_text(encoding="utf-8"))["label_interpolation"] is None
 
 
 def test_a_limit_of_memory_that_is_too_small_is_the_one_that_was_given(folder, capsys):

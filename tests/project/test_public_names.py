@@ -80,7 +80,7 @@ def raises(function: object) -> bool:
     ],
 )
 def test_the_test_sees_what_is_missing(source, wrong, tmp_path, monkeypatch):
-    (tmp_path / "some_functions.py").write_text(source + "\n")
+    (tmp_path / "some_functions.py").write_text(source + "\n", encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(__import__("sys").modules, "some_functions", raising=False)
     assert missing(import_module("some_functions").f) == wrong

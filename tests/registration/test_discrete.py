@@ -191,7 +191,7 @@ def test_small_images_and_searches_that_are_too_wide_are_refused():
         ({"smoothing": 0.0}, "smoothing must be positive"),
         ({"coupling": ()}, "at least one price"),
         ({"coupling": (0.1, -1.0)}, "coupling must be positive"),
-        ({"length": math.inf}, "length must be positive and finite"),
+        ({"length_scale": math.inf}, "length_scale must be positive and finite"),
         ({"min_determinant": 1.0}, "below 1"),
     ],
 )

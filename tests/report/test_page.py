@@ -84,7 +84,7 @@ def test_a_page_says_everything(tmp_path, make_full, dim):
         "2.00 GB",
         "register ",
         "torchdeform apply 'my results/transform.h5'",
-        "--set 'steps=[5, 4]'",
+        "--set 'optimiser.steps=[5, 4]'",
         "torch 2.",
         "0.4 before → 0.5 aligned → 0.8 after",
         "moving, as it was",

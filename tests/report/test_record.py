@@ -21,7 +21,7 @@ def test_record_is_plain_json(tmp_path, make_image, make_result):
     record = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
     assert record["similarity_after"] is None
     assert record["similarity_before"] == pytest.approx(0.1)
-    assert record["settings"]["window"] == 7
+    assert record["settings"]["similarity"]["window"] == 7
     assert record["fixed"]["size"] == [31, 26, 20]
     assert record["folds"] == 0
     assert 0 < record["determinant_min"] < 1 < record["determinant_max"]

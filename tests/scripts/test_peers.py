@@ -168,7 +168,7 @@ def test_a_run_is_a_row_a_failure_too_and_nothing_runs_twice(options, tmp_path, 
     monkeypatch.setitem(peers.TOOLS, "missing", replace(TOOLS["unregistered"], package="none"))
     file = tmp_path / "runs.json"
     peers.run_all(options, peers.Book(file))  # a fresh process knows no tool of that name
-    still, ours, missing = json.loads(file.read_text())
+    still, ours, missing = json.loads(file.read_text(encoding="utf-8"))
     assert still["folds"] == 0
     assert ours["folds"] == 0
     assert ours["dice"] > still["dice"] > 0

@@ -16,11 +16,6 @@ from torchdeform.solvers.cg import Operator, conjugate_gradient
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
-@pytest.fixture(autouse=True)
-def _seed():
-    torch.manual_seed(0)
-
-
 def spd(size: int, condition: float = 100.0, dtype: torch.dtype = torch.float64) -> Tensor:
     """Return a random symmetric matrix with eigenvalues from 1 to ``condition``."""
     basis = torch.linalg.qr(torch.randn(size, size, dtype=torch.float64)).Q

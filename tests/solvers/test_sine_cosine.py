@@ -15,11 +15,6 @@ from torchdeform.solvers.sine_cosine import KINDS, inverse_transform, separable_
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
-@pytest.fixture(autouse=True)
-def _seed():
-    torch.manual_seed(0)
-
-
 @pytest.fixture(params=["product", "fft"])
 def way(request, monkeypatch) -> str:
     """Force one of the two ways to compute a sum."""

@@ -5,6 +5,7 @@ from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, get_type_hints
 
 from torchdeform.errors import InputError, nearest_name, require_choice
@@ -211,13 +212,14 @@ def _whole_group(name: str, value: object) -> object:
     if not isinstance(value, Mapping):
         return {SHORT_FORMS[name]: value}
     weights = name == "similarity" and not known & value.keys() and (not value or MEASURES.keys() & value.keys())
-    return {SHORT_FORMS[name]: value} if weights else value
+    return {SHORT_FORMS[name]: MappingProxyType(dict(value))} if weights else value
 
 
 def _merge(base: dict[str, Any], change: Mapping[str, Any]) -> None:
-    """Lay ``change`` over ``base``, mapping by mapping."""
+    """Lay ``change`` over ``base``, mapping by mapping; weights of measures that are given as a whole replace others."""
     for key, value in change.items():
-        if isinstance(value, dict) and isinstance(base.get(key), dict):
+        if isinstance(value, dict) and isinstance(base.get(key), Mapping):
+            base[key] = dict(base[key])
             _merge(base[key], value)
         else:
             base[key] = dict(value) if isinstance(value, dict) else value

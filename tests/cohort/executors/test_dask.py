@@ -12,6 +12,9 @@ from torchdeform.cohort.executors.worker import EngineError
 from torchdeform.cohort.run import Event, run
 from torchdeform.cohort.settings import ClusterSettings, EngineSettings
 
+# Away from every network dask has no address to look up, and takes the name of the machine.
+pytestmark = pytest.mark.filterwarnings("ignore:Couldn't detect a suitable IP address")
+
 
 def worker_processes() -> list[int]:
     """Processes of the local cluster that this process started."""

@@ -26,14 +26,14 @@ from torchdeform.errors import ComputationError
 
 @pytest.fixture(scope="module")
 def pool() -> Iterator[LocalExecutor]:
-    """Two workers, whose calls may take two seconds."""
-    with LocalExecutor([Worker({"OMP_NUM_THREADS": "3"}) for _ in range(2)], timeout=2.0) as executor:
+    """Two workers, whose calls may take as long as a call can take here."""
+    with LocalExecutor([Worker({"OMP_NUM_THREADS": "3"}) for _ in range(2)], timeout=300.0) as executor:
         yield executor
 
 
 def gone(pid: int) -> bool:
-    """Whether a process ends within a few seconds."""
-    for _ in range(100):
+    """Whether a process ends within a minute."""
+    for _ in range(1200):
         try:
             state = (
                 Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()[0]
@@ -79,12 +79,13 @@ def test_a_call_that_dies_costs_itself_only(pool, function, argument, sentence):
     assert [future.result() for future in others + later] == [math.sqrt(x) for x in range(4)] * 2
 
 
-def test_a_call_that_hangs_is_given_up(pool):
+def test_a_call_that_hangs_is_given_up():
     start = time.monotonic()
-    with pytest.raises(TimeLimit, match="stopped after 2 seconds"):
-        pool.submit(time.sleep, 600.0).result()
-    assert time.monotonic() - start < 300
-    assert pool.submit(math.sqrt, 4.0).result() == 2.0
+    with LocalExecutor([Worker()], timeout=2.0) as executor:
+        with pytest.raises(TimeLimit, match="stopped after 2 seconds"):
+            executor.submit(time.sleep, 600.0).result()
+        assert time.monotonic() - start < 300
+        assert executor.submit(math.sqrt, 4.0).result() == 2.0
 
 
 def test_an_answer_that_cannot_be_sent_is_an_error(pool):
