@@ -60,7 +60,7 @@ def test_pictures_end_to_end(folder, engine, capsys):
     out, err = capsys.readouterr()
     assert err == ""
     assert 3 <= len(out.splitlines()) <= 6
-    for word in ("similarity", "folds", "determinant", "inverse error", "seconds", "results/one"):
+    for word in ("similarity", "folds", "determinant", "inverse consistency", "seconds", "results/one"):
         assert word in out
     assert _names(folder / "results" / "one") == sorted([*RESULTS, "warped.png"])
     warped = read_image("results/one/warped.png")

@@ -55,6 +55,7 @@ def test_spacing_is_one_unless_given():
     assert grid == Grid((3, 4), (1.0, 1.0))
     assert hash(grid) == hash(Grid((3, 4)))
     assert (grid.dim, grid.axes, grid.extent, grid.cell_volume) == (2, (2, 3), (2.0, 3.0), 1.0)
+    assert Grid((3, 4, 5)).size_text == "5×4×3"
     with pytest.raises(FrozenInstanceError):
         grid.shape = (5, 5)  # type: ignore[misc]
 

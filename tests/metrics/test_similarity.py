@@ -15,7 +15,14 @@ from torchdeform.core.warp import warp
 from torchdeform.errors import InputError
 from torchdeform.io import write_image
 from torchdeform.metrics.mind import mind_ssc
-from torchdeform.metrics.similarity import MEASURES, features, make_similarity, needs_common_scale, similarity_weights
+from torchdeform.metrics.similarity import (
+    MEASURES,
+    features,
+    make_similarity,
+    measure_name,
+    needs_common_scale,
+    similarity_weights,
+)
 from torchdeform.nn import DeformableRegistration, SimilarityLoss
 from torchdeform.pipeline.citations import citations
 from torchdeform.pipeline.config import load_settings
@@ -164,3 +171,7 @@ def test_a_new_measure_is_a_new_row(monkeypatch, tmp_path):
     files = PairFiles(fixed=path, moving=path, out=tmp_path)
     slow, fast = (estimate([Job(name="a", files=files, settings=some)]).seconds for some in (settings, old))
     assert slow > fast
+
+
+def test_several_measures_have_one_name():
+    assert (measure_name("mi"), measure_name({"lncc": 1, "mi": 0.5})) == ("mi", "lncc + mi")

@@ -7,7 +7,7 @@ import pytest
 import SimpleITK as sitk
 
 from torchdeform.cli.main import main
-from torchdeform.io.labels import read_labels
+from torchdeform.io.images import read_labels
 
 SHAPES = {2: (40, 44), 3: (16, 18, 20)}
 

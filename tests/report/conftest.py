@@ -11,8 +11,7 @@ from nested_settings import settings_of
 from torchdeform.core.transform import Affine
 from torchdeform.metrics.evaluation import Evaluation, Measures
 from torchdeform.registration.affine.align import Alignment
-from torchdeform.report.command_lines import repeat_command
-from torchdeform.report.record import describe
+from torchdeform.report.record import describe, repeat_command
 from torchdeform.report.report_data import ReportData, make_report_data
 
 SHAPES = {2: (40, 52), 3: (20, 26, 31)}

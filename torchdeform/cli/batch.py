@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from torchdeform.cli.options import Quiet, table
+from torchdeform.cli.options import Quiet, flag, table
 from torchdeform.cli.progress import CohortProgress, stoppable
 from torchdeform.cohort.estimate import Costs, estimate
 from torchdeform.cohort.plan import DESCRIPTION, Plan, description, plan
@@ -19,12 +19,8 @@ from torchdeform.pipeline.memory import readable
 from torchdeform.report.record import write_json
 
 CohortFile = Annotated[Path, typer.Argument(metavar="COHORT.yaml", help="What to register, and how.")]
-DryRun = Annotated[
-    bool, typer.Option("--dry-run", metavar="", help="Show the pairs, missing files, time and memory; run nothing.")
-]
-PrintConfig = Annotated[
-    bool, typer.Option("--print-config", metavar="", help="Print the file with all defaults; run nothing.")
-]
+DryRun = Annotated[bool, flag("--dry-run", "Show the pairs, missing files, time and memory; run nothing.")]
+PrintConfig = Annotated[bool, flag("--print-config", "Print the file with all defaults; run nothing.")]
 Only = Annotated[
     list[str] | None,
     typer.Option(metavar="NAME", help="Only pairs with this name, or its start (sub-01), or like sub-0*; repeatable."),
@@ -32,7 +28,7 @@ Only = Annotated[
 Resume = Annotated[
     bool, typer.Option("--resume/--no-resume", help="Skip pairs that are done with the same files and settings.")
 ]
-RetryFailed = Annotated[bool, typer.Option("--retry-failed", metavar="", help="Also run pairs that failed before.")]
+RetryFailed = Annotated[bool, flag("--retry-failed", "Also run pairs that failed before.")]
 SchemaOut = Annotated[
     Path | None, typer.Option("--out", metavar="FILE.json", show_default="standard output", help="Where to write it.")
 ]

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from torchdeform.cli.options import FixedMask, Json, MovingMask, completion, print_json
+from torchdeform.cli.options import FixedMask, Json, MovingMask, choice, print_json
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError, require_choice
 from torchdeform.io import read_image
@@ -23,10 +23,7 @@ Moving = Annotated[Path, typer.Argument(metavar="MOVING", help="Image that is to
 Picture = Annotated[
     Path | None, typer.Option("--out", metavar="PICTURE.png", show_default=False, help="Write an overlay picture.")
 ]
-Align = Annotated[
-    str,
-    typer.Option(metavar="KIND", help=f"Alignment: {', '.join(ALIGNMENTS)}.", autocompletion=completion(ALIGNMENTS)),
-]
+Align = Annotated[str, choice(ALIGNMENTS, "Alignment: {}.", "KIND")]
 
 
 def check(

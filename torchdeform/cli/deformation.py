@@ -2,11 +2,11 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args
+from typing import Annotated, cast, get_args
 
 import typer
 
-from torchdeform.cli.options import Device, Json, Out, Quiet, completion, print_json, table
+from torchdeform.cli.options import Device, Json, Out, Quiet, choice, flag, folds_text, optional_file, print_json, table
 from torchdeform.deformation.velocity import VelocityName
 from torchdeform.errors import InputError
 from torchdeform.io.files import stem
@@ -21,31 +21,19 @@ from torchdeform.pipeline.deformation import (
 from torchdeform.pipeline.register import choose_device
 
 ImageFile = Annotated[Path, typer.Argument(metavar="IMAGE", help="Image, 2D or 3D.")]
-Monitor = Annotated[
-    str,
-    typer.Option(
-        metavar="NAME",
-        help=f"Where cells are small: {', '.join(get_args(MonitorName))} (IMAGE is f itself).",
-        autocompletion=completion(get_args(MonitorName)),
-    ),
-]
+Monitor = Annotated[str, choice(get_args(MonitorName), "Where cells are small: {} (IMAGE is f itself).")]
 FMin = Annotated[float, typer.Option("--f-min", metavar="F", help="Size of the smallest cells, relative to --f-max.")]
 FMax = Annotated[float, typer.Option("--f-max", metavar="F", help="Size of the largest cells.")]
 Smoothing = Annotated[
     float | None,
     typer.Option(metavar="MM", show_default="2 voxels; simulate: 1", help="Standard deviation of the smoothing."),
 ]
-Velocity = Annotated[
-    str,
-    typer.Option(
-        metavar="NAME", help=f"{', '.join(get_args(VelocityName))}.", autocompletion=completion(get_args(VelocityName))
-    ),
-]
+Velocity = Annotated[str, choice(get_args(VelocityName), "{}.")]
 DisplacementFile = Annotated[
     Path, typer.Argument(metavar="DISPLACEMENT", help="ITK displacement field, such as displacement.nii.gz.")
 ]
 Order = Annotated[int, typer.Option(metavar="N", help="Order of the finite differences, 2 or 4.")]
-Refine = Annotated[bool, typer.Option("--refine", metavar="", help="Correct the map to solver precision.")]
+Refine = Annotated[bool, flag("--refine", "Correct the map to solver precision.")]
 Steps = Annotated[
     int | None, typer.Option(metavar="N", show_default=False, help="Write N time steps from the identity to the map.")
 ]
@@ -53,9 +41,7 @@ Labels = Annotated[Path, typer.Option(metavar="FILE", help="Label image on the g
 Volumes = Annotated[
     list[str], typer.Option("--volume", metavar="LABEL=FACTOR", help="New volume over old; can be repeated.")
 ]
-RigidMask = Annotated[
-    Path | None, typer.Option(metavar="FILE", show_default=False, help="Mask of what must not move (not 0 there).")
-]
+RigidMask = Annotated[Path | None, optional_file("Mask of what must not move (not 0 there).")]
 
 
 def adapt_grid(
@@ -78,7 +64,7 @@ def adapt_grid(
     settings = GridSettings(cast(MonitorName, monitor), f_min, f_max, smoothing, cast(VelocityName, velocity))
     folder = out or Path(f"{stem(image)}-grid")
     record = adapt_grid_to_file(image, folder, settings, choose_device(device))
-    off = f"off by {_number(record, 'determinant_error_mean'):.2g} on average"
+    off = f"off by {record['determinant_error_mean']:.2g} on average"
     _print(folder, record, {"determinant / monitor": off}, json=json, quiet=quiet)
 
 
@@ -98,7 +84,7 @@ def reconstruct(
     """
     folder = out or Path(f"{stem(displacement)}-reconstructed")
     record = reconstruct_file(displacement, folder, order, refine, steps, choose_device(device))
-    distance = f"{_number(record, 'distance_max'):.3g} at most, {_number(record, 'distance_mean'):.3g} on average"
+    distance = f"{record['distance_max']:.3g} at most, {record['distance_mean']:.3g} on average"
     _print(folder, record, {"distance to the given map": distance}, json=json, quiet=quiet)
 
 
@@ -119,8 +105,7 @@ def simulate(
     """
     folder = out or Path(f"{stem(image)}-simulated")
     record = simulate_file(image, labels, _factors(volume), folder, rigid_mask, smoothing)
-    volumes = cast("list[dict[str, Any]]", record["volumes"])
-    reached = ", ".join(f"{v['label']}: {v['reached']:.4f} (asked {v['asked']:g})" for v in volumes)
+    reached = ", ".join(f"{v['label']}: {v['reached']:.4f} (asked {v['asked']:g})" for v in record["volumes"])
     _print(folder, record, {"volumes": reached}, json=json, quiet=quiet)
 
 
@@ -140,16 +125,10 @@ def _factor(text: str) -> tuple[int, float]:
         raise InputError(f"--volume needs LABEL=FACTOR such as 17=0.95, got {text!r}") from error
 
 
-def _number(record: Record, name: str) -> float:
-    return float(cast(float, record[name]))
-
-
 def _print(folder: Path, record: Record, lines: dict[str, str], *, json: bool, quiet: bool) -> None:
     """Print the record for a program, or a few lines for a person."""
     if json:
         print_json({**record, "out": str(folder)})
     if json or quiet:
         return
-    low, high = _number(record, "determinant_min"), _number(record, "determinant_max")
-    common = {"folds": f"{record['folds']}, determinant {low:.3g} to {high:.3g}"}
-    typer.echo(table(lines | common | {"results": f"{folder}{os.sep}"}))
+    typer.echo(table({**lines, "folds": folds_text(record), "results": f"{folder}{os.sep}"}))

@@ -1,8 +1,8 @@
 """Options that several verbs share, with one name and one meaning each."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import typer
@@ -18,22 +18,30 @@ def _print_version(asked: bool) -> None:
         raise typer.Exit
 
 
-def completion(names: Iterable[str]) -> Callable[[], list[str]]:
-    """Return the values that a shell offers for an option, for `typer.Option`."""
-    return lambda: list(names)
+def flag(name: str, about: str) -> Any:
+    """Return an option that is given or not."""
+    return typer.Option(name, metavar="", help=about)
+
+
+def optional_file(about: str, metavar: str = "FILE") -> Any:
+    """Return an option for a file that may be left out."""
+    return typer.Option(metavar=metavar, show_default=False, help=about)
+
+
+def choice(names: Sequence[str], about: str, metavar: str = "NAME", **how: Any) -> Any:
+    """Return an option for one of some names, which a shell completes; ``{}`` in its help stands for them."""
+    return typer.Option(metavar=metavar, help=about.format(", ".join(names)), autocompletion=lambda: list(names), **how)
 
 
 Out = Annotated[
     Path | None,
     typer.Option(metavar="DIR", show_default="named after the image", help="Folder for the results."),
 ]
-FixedMask = Annotated[Path | None, typer.Option(metavar="FILE", show_default=False, help="Where FIXED counts (not 0).")]
-MovingMask = Annotated[
-    Path | None, typer.Option(metavar="FILE", show_default=False, help="Where MOVING counts (not 0).")
-]
-Device = Annotated[str, typer.Option(metavar="NAME", help="auto, cpu or cuda.", autocompletion=completion(DEVICES))]
-Quiet = Annotated[bool, typer.Option("--quiet", metavar="", help="Print errors only.")]
-Json = Annotated[bool, typer.Option("--json", metavar="", help="Print one JSON record, for programs.")]
+FixedMask = Annotated[Path | None, optional_file("Where FIXED counts (not 0).")]
+MovingMask = Annotated[Path | None, optional_file("Where MOVING counts (not 0).")]
+Device = Annotated[str, choice(DEVICES, "auto, cpu or cuda.")]
+Quiet = Annotated[bool, flag("--quiet", "Print errors only.")]
+Json = Annotated[bool, flag("--json", "Print one JSON record, for programs.")]
 Version = Annotated[
     bool,
     typer.Option(
@@ -45,6 +53,11 @@ Version = Annotated[
 def print_json(record: Mapping[str, object]) -> None:
     """Print a record as JSON, the only line on standard output."""
     typer.echo(as_json(record))
+
+
+def folds_text(record: Mapping[str, Any]) -> str:
+    """Return the folds of a map and the range of its determinant, from its record."""
+    return f"{record['folds']}, determinant {record['determinant_min']:.3g} to {record['determinant_max']:.3g}"
 
 
 def table(lines: dict[str, str]) -> str:

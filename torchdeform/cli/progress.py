@@ -1,4 +1,4 @@
-"""Progress of a cohort: a bar on a terminal, plain lines elsewhere; and how a run is stopped."""
+"""Progress of a registration or a cohort: a bar on a terminal, plain lines elsewhere; and how a run is stopped."""
 
 import signal
 from collections.abc import Iterator
@@ -9,10 +9,11 @@ from typing import Self
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
 
 from torchdeform.cohort.run import BEGIN, END, SKIPPED, Event
 from torchdeform.cohort.task import FAILED
+from torchdeform.registration.result import Progress as Step
 
 _STOPPED = 130  # exit code of a command that Ctrl-C ended, as shells have it
 
@@ -34,7 +35,43 @@ def stoppable(verb: str) -> Iterator[None]:
         signal.signal(signal.SIGTERM, earlier)
 
 
-class CohortProgress:
+class _Bar:
+    """A progress bar on stderr while a block runs, on a terminal only."""
+
+    def __init__(self, quiet: bool, title: str, detail: str, total: float | None, *columns: ProgressColumn) -> None:
+        console = Console(stderr=True, highlight=False)
+        shown = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[detail]}"), *columns)
+        self._on_terminal = console.is_terminal and not quiet
+        self._progress = Progress(*shown, console=console, transient=True, disable=not self._on_terminal)
+        self._task = self._progress.add_task(title, total=total, detail=detail)
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+
+class StepProgress(_Bar):
+    """Shows the steps of one registration.
+
+    Args:
+        quiet: show nothing.
+    """
+
+    def __init__(self, quiet: bool = False) -> None:
+        super().__init__(quiet, "reading", "", 1.0, TimeElapsedColumn())
+
+    def show(self, step: Step) -> None:
+        """Show one step of the optimisation. Every level is the same share of the bar."""
+        done = (step.level + step.step / max(step.steps, 1)) / step.levels
+        title = f"level {step.level + 1}/{step.levels} {'×'.join(map(str, step.shape))}"
+        detail = f"step {step.step}, similarity {step.similarity.mean().item():.4g}"
+        self._progress.update(self._task, completed=done, description=title, detail=detail)
+
+
+class CohortProgress(_Bar):
     """Shows the events of a run on stderr, failures with their sentences.
 
     Args:
@@ -43,19 +80,8 @@ class CohortProgress:
     """
 
     def __init__(self, quiet: bool = False, title: str = "pairs") -> None:
-        console = Console(stderr=True, highlight=False)
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[detail]}"))
-        self._on_terminal = console.is_terminal and not quiet
+        super().__init__(quiet, title, "looking for finished work", None)
         self._quiet, self._title, self._skipped = quiet, title, 0
-        self._progress = Progress(*columns, console=console, transient=True, disable=not self._on_terminal)
-        self._task = self._progress.add_task(title, total=None, detail="looking for finished work")
-
-    def __enter__(self) -> Self:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
 
     def show(self, event: Event) -> None:
         """Show an event."""

@@ -5,8 +5,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from torchdeform.cli.options import (
     Device,
@@ -16,63 +14,39 @@ from torchdeform.cli.options import (
     Out,
     Quiet,
     Version,
-    completion,
+    choice,
+    flag,
+    folds_text,
+    optional_file,
     print_json,
     table,
 )
+from torchdeform.cli.progress import StepProgress
 from torchdeform.io.files import stem
-from torchdeform.metrics.similarity import similarity_weights
+from torchdeform.metrics.similarity import measure_name
 from torchdeform.pipeline.config import load_settings, parse_override, preset_names
 from torchdeform.pipeline.memory import parse_size
 from torchdeform.pipeline.register import REPORT, Outcome, PairFiles, register_files
 from torchdeform.registration.affine.settings import ALIGNMENTS
-from torchdeform.registration.result import Progress as Step
 
 Fixed = Annotated[
     Path,
     typer.Argument(metavar="FIXED", help="Image that stays: PNG, TIFF, NIfTI, NRRD, a DICOM folder ..."),
 ]
 Moving = Annotated[Path, typer.Argument(metavar="MOVING", help="Image that is warped onto it.")]
-FixedPoints = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", show_default=False, help="Landmarks (csv, elastix txt, Slicer), measured ..."),
-]
-MovingPoints = Annotated[
-    Path | None, typer.Option(metavar="FILE", show_default=False, help="... and the same landmarks in MOVING.")
-]
-FixedLabels = Annotated[
-    Path | None, typer.Option(metavar="FILE", show_default=False, help="Regions, whose overlap is measured ...")
-]
-MovingLabels = Annotated[
-    Path | None, typer.Option(metavar="FILE", show_default=False, help="... and the same regions of MOVING.")
-]
-Align = Annotated[
-    str | None,
-    typer.Option(
-        metavar="KIND",
-        show_default=False,
-        help=f"First: {', '.join(ALIGNMENTS)} (usual).",
-        autocompletion=completion(ALIGNMENTS),
-    ),
-]
+FixedPoints = Annotated[Path | None, optional_file("Landmarks (csv, elastix txt, Slicer), measured ...")]
+MovingPoints = Annotated[Path | None, optional_file("... and the same landmarks in MOVING.")]
+FixedLabels = Annotated[Path | None, optional_file("Regions, whose overlap is measured ...")]
+MovingLabels = Annotated[Path | None, optional_file("... and the same regions of MOVING.")]
+Align = Annotated[str | None, choice(ALIGNMENTS, "First: {} (usual).", "KIND", show_default=False)]
 PointsWeight = Annotated[
     float | None, typer.Option(metavar="W", show_default="0", help="Weight of the landmarks against the similarity.")
 ]
-Symmetric = Annotated[
-    bool, typer.Option("--symmetric", metavar="", help="Treat both images alike: swapping them inverts the map.")
-]
+Symmetric = Annotated[bool, flag("--symmetric", "Treat both images alike: swapping them inverts the map.")]
 Memory = Annotated[
     str | None, typer.Option(metavar="SIZE", show_default="what is free", help="Use at most this, such as 4GB.")
 ]
-Preset = Annotated[
-    str,
-    typer.Option(
-        metavar="NAME",
-        show_default=False,
-        help=f"Settings to start from: {', '.join(preset_names())}.",
-        autocompletion=preset_names,
-    ),
-]
+Preset = Annotated[str, choice(preset_names(), "Settings to start from: {}.", show_default=False)]
 Config = Annotated[
     Path | None, typer.Option(metavar="FILE", help="YAML file with settings that differ from the preset.")
 ]
@@ -125,7 +99,7 @@ def register(
         moving_labels=moving_labels,
     )
     limit = None if memory is None else parse_size(memory)
-    with _Bar(quiet) as bar:
+    with StepProgress(quiet) as bar:
         outcome = register_files(files, settings, device=device, memory=limit, callback=bar.show)
     if json:
         print_json({**outcome.record, "out": str(outcome.folder)})
@@ -137,11 +111,11 @@ def register(
 
 def summary(outcome: Outcome) -> str:
     """Return the most important figures of a registration in a few lines."""
-    r, measure = outcome.record, " + ".join(similarity_weights(outcome.result.settings.similarity.measure))
+    r = outcome.record
     lines = {
-        f"similarity ({measure})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
-        "folds": f"{r['folds']}, determinant {r['determinant_min']:.3g} to {r['determinant_max']:.3g}",
-        "inverse error": f"{r['inverse_error_mean']:.2g} voxel on average, {r['inverse_error_max']:.2g} at most",
+        f"similarity ({measure_name(r['similarity'])})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
+        "folds": folds_text(r),
+        "inverse consistency": f"{r['inverse_error_mean']:.2g} voxel on average, {r['inverse_error_max']:.2g} at most",
         **_measured(r),
         "seconds": f"{sum(r['seconds'].values()):.1f} on {r['device']}",
         "results": f"{outcome.folder}{os.sep} ({', '.join(r['files'])})",
@@ -154,41 +128,7 @@ def _measured(record: dict[str, Any]) -> dict[str, str]:
     """Return lines about labels and landmarks, if they were given."""
     lines = {}
     for key, name in (("dice_mean", "Dice"), ("landmark_error_mean", "landmark error")):
-        stages = [
-            stage for stage in ("before", "aligned", "after") if key in record.get("evaluation", {}).get(stage, {})
-        ]
-        if stages:
-            lines[name] = " -> ".join(f"{record['evaluation'][stage][key]:.4g}" for stage in stages)
+        figures = [f"{stage[key]:.4g}" for stage in record["evaluation"].values() if key in stage]
+        if figures:
+            lines[name] = " -> ".join(figures)
     return lines
-
-
-class _Bar:
-    """A progress bar on stderr, on a terminal only."""
-
-    def __init__(self, quiet: bool) -> None:
-        console = Console(stderr=True)
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[detail]}"),
-            TimeElapsedColumn(),
-        )
-        hidden = quiet or not console.is_terminal
-        self._progress = Progress(*columns, console=console, transient=True, disable=hidden)
-        self._task = self._progress.add_task("reading", total=1.0, detail="")
-
-    def __enter__(self) -> "_Bar":
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def show(self, step: Step) -> None:
-        """Show one step of the optimisation. Every level is the same share of the bar."""
-        done = (step.level + step.step / max(step.steps, 1)) / step.levels
-        size = "×".join(map(str, step.shape))
-        detail = f"step {step.step}, similarity {step.similarity.mean().item():.4g}"
-        self._progress.update(
-            self._task, completed=done, description=f"level {step.level + 1}/{step.levels} {size}", detail=detail
-        )

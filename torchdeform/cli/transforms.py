@@ -9,14 +9,13 @@ from typing import Annotated
 import torch
 import typer
 
-from torchdeform.cli.options import Json, Quiet, completion, print_json
+from torchdeform.cli.options import Json, Quiet, choice, flag, optional_file, print_json
 from torchdeform.core.image import Image
 from torchdeform.core.interpolation import COPYING, MODES
 from torchdeform.core.transform import Transform
 from torchdeform.errors import InputError, require_choice
 from torchdeform.io.files import require_writable, suffix
-from torchdeform.io.images import FORMATS, read_image, read_optional, write_image
-from torchdeform.io.labels import read_labels, write_labels
+from torchdeform.io.images import FORMATS, read_image, read_labels, read_optional, write_image, write_labels
 from torchdeform.io.points import read_points, require_points_file, write_points
 from torchdeform.io.transforms import read_transform, require_transform_file, write_transform
 
@@ -43,10 +42,7 @@ Reference = Annotated[
         help="Fixed image, whose grid the result gets (the moving image with --inverse).",
     ),
 ]
-Counted = Annotated[
-    Path | None,
-    typer.Option(metavar="IMAGE", show_default=False, help="Image of the voxels, if POINTS counts in voxels."),
-]
+Counted = Annotated[Path | None, optional_file("Image of the voxels, if POINTS counts in voxels.", "IMAGE")]
 FieldGrid = Annotated[
     Path | None,
     typer.Option(
@@ -55,15 +51,8 @@ FieldGrid = Annotated[
         help="Grid of the result, if that is a field (.nii.gz).",
     ),
 ]
-Interpolation = Annotated[
-    str,
-    typer.Option(
-        metavar="NAME",
-        help=f"{', '.join(MODES)}; label or nearest keep values and their type.",
-        autocompletion=completion(MODES),
-    ),
-]
-Inverse = Annotated[bool, typer.Option("--inverse", metavar="", help="Use the inverse of TRANSFORM.")]
+Interpolation = Annotated[str, choice(MODES, "{}; label or nearest keep values and their type.")]
+Inverse = Annotated[bool, flag("--inverse", "Use the inverse of TRANSFORM.")]
 Outside = Annotated[float, typer.Option(metavar="VALUE", help="Value where MOVING does not reach.")]
 
 
@@ -129,7 +118,7 @@ def invert(
     if json:
         print_json({"out": out, "inverse_error_mean_mm": mean, "inverse_error_max_mm": largest})
     elif chain.reference is not None:
-        typer.echo(f"inverse error  {mean:.2g} mm on average, {largest:.2g} at most")
+        typer.echo(f"inverse consistency  {mean:.2g} mm on average, {largest:.2g} at most")
 
 
 def compose(transforms: TransformFiles, out: OutFile, reference: FieldGrid = None) -> None:

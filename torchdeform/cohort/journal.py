@@ -5,7 +5,7 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import time_ns
 from types import TracebackType
@@ -85,11 +85,8 @@ class Journal:
 
     def fingerprint(self, job: Job) -> str:
         """Return a hash of everything that a pair's results depend on: content of its files, settings, version."""
-        inputs = {
-            f.name: (path.suffix, self._digest(path))
-            for f in fields(job.files)
-            if f.name != "out" and (path := getattr(job.files, f.name)) is not None
-        }
+        given = ((name, path) for name, path in job.files.given().items() if name != "out")
+        inputs = {name: (path.suffix, self._digest(path)) for name, path in given}
         parts = {
             "version": __version__,
             "settings": asdict(job.settings),

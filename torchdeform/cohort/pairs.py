@@ -2,7 +2,7 @@
 
 import csv
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from itertools import combinations, pairwise, permutations
 from pathlib import Path
@@ -18,6 +18,10 @@ from torchdeform.pipeline.config import parse_override
 from torchdeform.pipeline.register import PairFiles
 
 _FILES = tuple(field.name for field in fields(PairFiles) if field.name != "out")
+_COLUMNS = ("name", *_FILES)  # of a table
+_SETTING = "settings."
+_SEPARATORS = {".csv": ",", ".tsv": "\t"}
+_EMPTY = ("", "n/a")  # BIDS writes n/a where there is nothing
 
 
 def find_images(images: Images) -> list[FoundFile]:
@@ -53,7 +57,7 @@ def pattern_pairs(pattern: PatternPairs, where: str) -> list[PairSpec]:
     if pattern.order is not None:
         for group in groups.values():
             group.sort(key=lambda one: natural_key(one.parts[str(pattern.order)]))
-    return [pair for group in groups.values() for pair in _PAIRINGS[pattern.pairing](group, pattern, where)]
+    return [pair for group in groups.values() for pair in _within(group, pattern, where)]
 
 
 def companions(one: FoundFile, images: Images, side: str) -> dict[str, Path]:
@@ -88,31 +92,26 @@ def _to_template(moving: FoundFile, pattern: PatternPairs, where: str) -> PairSp
     return _pair_spec(image_name(moving.path, moving.parts), files, where, subject_of(moving.parts))
 
 
-def _consecutive(group: list[FoundFile], pattern: PatternPairs, where: str) -> Iterator[PairSpec]:
-    for fixed, moving in pairwise(group):
-        yield _between(fixed, moving, pattern, where)
+def _within(group: list[FoundFile], pattern: PatternPairs, where: str) -> list[PairSpec]:
+    """Return the pairs of a group, by the kind of pairing."""
+    if pattern.pairing == "consecutive":
+        ends = pairwise(group)
+    elif pattern.pairing == "all":
+        ends = (permutations if pattern.both_ways else combinations)(group, 2)
+    else:
+        chosen = [one for one in group if pattern.reference.items() <= one.parts.items()]
+        if len(chosen) != 1:
+            return [_without_reference(group, len(chosen), pattern, where)]
+        ends = ((chosen[0], moving) for moving in group if moving is not chosen[0])
+    return [_between(fixed, moving, pattern, where) for fixed, moving in ends]
 
 
-def _all(group: list[FoundFile], pattern: PatternPairs, where: str) -> Iterator[PairSpec]:
-    for fixed, moving in (permutations if pattern.both_ways else combinations)(group, 2):
-        yield _between(fixed, moving, pattern, where)
-
-
-def _to_member(group: list[FoundFile], pattern: PatternPairs, where: str) -> Iterator[PairSpec]:
-    chosen = [one for one in group if pattern.reference.items() <= one.parts.items()]
-    if len(chosen) == 1:
-        for moving in group:
-            if moving is not chosen[0]:
-                yield _between(chosen[0], moving, pattern, where)
-        return
+def _without_reference(group: list[FoundFile], count: int, pattern: PatternPairs, where: str) -> PairSpec:
     reference = ", ".join(f"{key} {value}" for key, value in pattern.reference.items())
     parts = {key: group[0].parts[key] for key in pattern.within}
     name = "_".join(entity(*part) for part in parts.items()) or "group"
-    problem = f"{len(chosen)} of its {len(group)} images have {reference}, not one; check reference and the files"
-    yield PairSpec(name=name, files={}, where=where, subject=subject_of(parts), problem=problem)
-
-
-_PAIRINGS = {"consecutive": _consecutive, "all": _all, "group": _to_member}
+    problem = f"{count} of its {len(group)} images have {reference}, not one; check reference and the files"
+    return PairSpec(name=name, files={}, where=where, subject=subject_of(parts), problem=problem)
 
 
 def _between(fixed: FoundFile, moving: FoundFile, pattern: PatternPairs, where: str) -> PairSpec:
@@ -179,12 +178,6 @@ def _listed(pair: Pair, where: str) -> PairSpec:
     files = {key: path for key in _FILES if (path := getattr(pair, key)) is not None}
     name = pair.name or pair_name(pair.fixed, pair.moving, {}, {})
     return PairSpec(name=name, files=files, where=where, settings=pair.settings)
-
-
-_SEPARATORS = {".csv": ",", ".tsv": "\t"}
-_COLUMNS = ("name", *_FILES)
-_SETTING = "settings."
-_EMPTY = ("", "n/a")  # BIDS writes n/a where there is nothing
 
 
 def table_pairs(path: Path) -> list[PairSpec]:

@@ -15,7 +15,7 @@ from torchdeform.cohort.schema import Cohort
 from torchdeform.errors import InputError, nearest_name
 from torchdeform.io import read_displacement, read_image
 from torchdeform.io.files import atomic_folder
-from torchdeform.io.learn2reg import write_voxel_displacement
+from torchdeform.io.transforms import write_voxel_displacement
 from torchdeform.pipeline.register import Outcome, PairFiles, register_files
 from torchdeform.registration.result import Callback
 from torchdeform.registration.settings import RegistrationSettings
@@ -220,7 +220,7 @@ def register_job(job: Job, *, callback: Callback | None = None) -> Outcome:
 
 def _with_titles(files: PairFiles) -> PairFiles:
     """Write the landmarks into the pair's folder with the titles i, j, k for `read_points`; return the new files."""
-    given = {key: path for key in _POINTS if (path := getattr(files, key)) is not None}
+    given = {key: path for key, path in files.given().items() if key in _POINTS}
     with atomic_folder(files.out) as folder:
         for key, path in given.items():
             rows = path.read_text(encoding="utf-8-sig")

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from string import Template
 from typing import Annotated, Literal, Self
@@ -168,7 +169,7 @@ class EngineSettings(Strict):
 class TemplateSettings(Strict):
     """How a template is made."""
 
-    rounds: Annotated[int, Field(ge=1)] = 3
+    rounds: Count = 3
     """How often all images are registered, each time to the template of the round before."""
     reference: Place | None = None
     """Image that the first round registers to; the template gets its grid. By default the first of images."""
@@ -176,7 +177,7 @@ class TemplateSettings(Strict):
     """Position and orientation of the template: those of the reference, or the mean of all images."""
     match_intensities: bool = AveragingSettings.match_intensities
     """Scale all images to one mean and one standard deviation before they are averaged."""
-    corrections: Annotated[int, Field(ge=1)] = AveragingSettings.corrections
+    corrections: Count = AveragingSettings.corrections
     """Corrections in a round at most that bring the mean of the maps from the template to the identity."""
     tolerance: Annotated[float, Field(ge=0)] = AveragingSettings.tolerance
     """Largest displacement of that mean, in voxels, that counts as the identity."""
@@ -184,9 +185,4 @@ class TemplateSettings(Strict):
     @property
     def averaging(self) -> AveragingSettings:
         """The settings for the averages of a round."""
-        return AveragingSettings(
-            pose=self.pose,
-            match_intensities=self.match_intensities,
-            corrections=self.corrections,
-            tolerance=self.tolerance,
-        )
+        return AveragingSettings(**{field.name: getattr(self, field.name) for field in fields(AveragingSettings)})

@@ -5,7 +5,6 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from torchdeform import __version__
 from torchdeform.cohort.plan import Failure, Job
@@ -19,6 +18,8 @@ COLUMNS = ("name", "status", *FIGURES, "seconds", "peak_memory_mb", "gpu_memory_
 FAILURE_COLUMNS = ("name", "sentence", "log")
 
 _LOGS = "logs"
+_TEMPLATES = Path(__file__).parent / "templates"
+_SHOWN = ("report.html", "overview.png")  # the first that exists is linked from the name of a pair
 
 Row = Mapping[str, str | float]
 
@@ -62,19 +63,16 @@ def summarise(
         problems: pairs that cannot run.
     """
     problems = tuple(problems)
-    failures = [*problems]
-    failures += [
-        Failure(job.name, known[job.name].sentence, log_of(out, job.name))
-        for job in jobs
-        if job.name in known and known[job.name].status == FAILED
-    ]
+    lost = [job.name for job in jobs if job.name in known and known[job.name].status == FAILED]
+    failures = (*problems, *(Failure(name, known[name].sentence, log_of(out, name)) for name in lost))
     rows = [_row(job, out, known.get(job.name, PairReport(WAITING))) for job in jobs]
     rows += [dict.fromkeys(COLUMNS, "") | {"name": problem.name, "status": FAILED} for problem in problems]
     _write_table(out / SUMMARY, COLUMNS, rows)
-    _write_table(out / FAILURES, FAILURE_COLUMNS, [_failure_row(failure, out) for failure in failures])
-    write_page(out / PAGE, rows, failures)
+    failed = [_failure_row(failure, out) for failure in failures]
+    _write_table(out / FAILURES, FAILURE_COLUMNS, failed)
+    write_page(out / PAGE, rows, failed)
     counts = [row["status"] for row in rows]
-    return Summary(out, counts.count(DONE), counts.count(WAITING), tuple(failures))
+    return Summary(out, counts.count(DONE), counts.count(WAITING), failures)
 
 
 def _row(job: Job, out: Path, report: PairReport) -> Row:
@@ -101,27 +99,26 @@ def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> Non
         writer.writerows(rows)
 
 
-_TEMPLATES = Path(__file__).parent / "templates"
-_SHOWN = ("report.html", "overview.png")  # the first that exists is linked from the name of a pair
-
-
-def write_page(path: Path, rows: Sequence[Row], failures: Iterable[Failure]) -> None:
+def write_page(path: Path, rows: Sequence[Row], failures: Iterable[Row]) -> None:
     """Write the page of a cohort; all text is escaped.
 
     Args:
         path: the file; links are relative to its folder.
         rows: of the summary, all with the same columns.
-        failures: the pairs that failed.
+        failures: rows of the table of failures.
     """
     from jinja2 import Environment, FileSystemLoader
 
     loader = FileSystemLoader(_TEMPLATES)
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    why = {failure.name: failure for failure in failures}
+    why = {failure["name"]: failure for failure in failures}
     statuses = [str(row["status"]) for row in rows]
     text = environment.get_template(path.name).stream(
         columns=[column for column in _columns(rows) if column not in ("name", "status", "folder")],
-        rows=({"cells": row, "link": _link(path.parent, row), **_trouble(path.parent, row, why)} for row in rows),
+        rows=(
+            {"cells": row, "link": _link(path.parent, row), **_trouble(path.parent, why.get(row["name"], {}))}
+            for row in rows
+        ),
         counts={status: statuses.count(status) for status in (DONE, FAILED, WAITING)},
         title=path.absolute().parent.name,
         version=__version__,
@@ -142,9 +139,7 @@ def _link(folder: Path, row: Row) -> str:
     return next((f"{row['folder']}/{name}" for name in _SHOWN if (folder / str(row["folder"]) / name).is_file()), "")
 
 
-def _trouble(folder: Path, row: Row, why: Mapping[str, Failure]) -> dict[str, Any]:
-    failure = why.get(str(row["name"])) if row["status"] == FAILED else None
-    if failure is None:
-        return {"sentence": "", "log": ""}
-    log = failure.log
-    return {"sentence": failure.sentence, "log": log.relative_to(folder).as_posix() if log and log.is_file() else ""}
+def _trouble(folder: Path, failure: Row) -> Row:
+    """Return why a pair failed and its log, if there is one; both are empty for other pairs."""
+    log = failure.get("log", "")
+    return {"sentence": failure.get("sentence", ""), "log": log if (folder / str(log)).is_file() else ""}

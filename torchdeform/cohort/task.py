@@ -7,7 +7,7 @@ import sys
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter, strftime
 from typing import Any
@@ -111,8 +111,7 @@ def _figures(record: dict[str, Any]) -> dict[str, float]:
 def _log_job(job: Job) -> None:
     """Write the job, the machine and the process into the log."""
     lines = [f"{strftime('%FT%T')} {job.name} on {platform.node()}, process {os.getpid()}"]
-    given = ((f.name, getattr(job.files, f.name)) for f in fields(job.files))
-    lines += [f"  {name}: {path}" for name, path in given if path is not None]
+    lines += [f"  {name}: {path}" for name, path in job.files.given().items()]
     sys.stderr.write("\n".join([*lines, f"  {job.settings}"]) + "\n")
 
 

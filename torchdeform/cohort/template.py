@@ -21,8 +21,7 @@ from torchdeform.core.warp import compose
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.io import read_image, read_transform, write_image, write_transform
 from torchdeform.io.files import atomic_folder, require_writable
-from torchdeform.io.images import ending_like
-from torchdeform.io.labels import read_labels, write_labels
+from torchdeform.io.images import ending_like, read_labels, write_labels
 from torchdeform.pipeline.register import PairFiles, choose_device
 from torchdeform.registration.template import Lazy, Template, identity_map, make_template
 from torchdeform.report.figures import write_gallery
@@ -80,11 +79,6 @@ class Round:
     reference: Path
     subjects: tuple[Subject, ...]
     key: str
-
-    @staticmethod
-    def pair(folder: Path, name: str) -> Path:
-        """Return the folder of an image's registration."""
-        return folder / _PAIRS / name
 
 
 def build(cohort: Cohort, *, retry_failed: bool = False, report: Listener | None = None) -> Built:
@@ -153,9 +147,8 @@ def _register(
 
 
 def _job(cohort: Cohort, folder: Path, reference: Path, subject: Subject) -> Job:
-    files = PairFiles(
-        fixed=reference, moving=subject.image, moving_mask=subject.mask, out=Round.pair(folder, subject.name)
-    )
+    out = folder / _PAIRS / subject.name
+    files = PairFiles(fixed=reference, moving=subject.image, moving_mask=subject.mask, out=out)
     return Job(name=subject.name, files=files, settings=cohort.resolve(), device=cohort.device, memory=cohort.memory)
 
 
@@ -200,7 +193,7 @@ def _read_map(current: Round, subject: Subject, reference: Image) -> Transform:
     """Return the map from the reference to an image, with its inverse."""
     if subject.image == current.reference:
         return identity_map(reference)
-    pair = Round.pair(current.folder, subject.name)
+    pair = current.folder / _PAIRS / subject.name
     forward, back = (read_transform(pair / name).stages for name in (_TRANSFORM, _INVERSE))
     fields = [stage.field for stage in (forward[0], back[-1]) if isinstance(stage, Displacement)]
     known = Displacement(*(replace(field, data=field.data.float()) for field in fields))

@@ -56,6 +56,11 @@ class Grid:
         return tuple(range(2, 2 + self.dim))
 
     @property
+    def size_text(self) -> str:
+        """Number of nodes in x, y, z order as in ITK, such as ``256×256×160``."""
+        return "×".join(map(str, self.shape[::-1]))
+
+    @property
     def extent(self) -> tuple[float, ...]:
         """Side lengths (n_k − 1) h_k of Ω in units of spacing."""
         return tuple((n - 1) * h for n, h in zip(self.shape, self.spacing, strict=True))

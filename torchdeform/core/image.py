@@ -176,7 +176,7 @@ def require_registrable(image: Image) -> None:
 def require_same_place(image: Image, other: Image, *, atol: float = 1e-3) -> None:
     """Raise `InputError` unless the nodes of both images are the same points of the world, to ``atol`` of a voxel."""
     if image.grid.shape != other.grid.shape:
-        sizes = f"{'×'.join(map(str, image.grid.shape[::-1]))} and {'×'.join(map(str, other.grid.shape[::-1]))}"
+        sizes = f"{image.grid.size_text} and {other.grid.size_text}"
         raise InputError(f"{image.name} and {other.name} must lie on one grid, but have {sizes} nodes; resample one")
     ends = box_corners(image.grid)
     apart = (image.to_world(ends) - other.to_world(ends)).norm(dim=1).max()

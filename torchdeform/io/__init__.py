@@ -1,7 +1,6 @@
 """Files in and out: images, labels, points, displacement fields and transforms, in ITK's conventions."""
 
-from torchdeform.io.images import read_image, write_image
-from torchdeform.io.labels import read_labels, write_labels
+from torchdeform.io.images import read_image, read_labels, write_image, write_labels
 from torchdeform.io.points import Points, matched, read_points, write_points
 from torchdeform.io.transforms import read_displacement, read_transform, write_displacement, write_transform
 

@@ -171,15 +171,11 @@ def _floats(cells: Sequence[object], name: str) -> list[float]:
 
 
 def _read_csv(text: str, name: str) -> _Table:
-    return _from_rows(list(csv.reader(text.splitlines(), delimiter=";" if ";" in text.split("\n")[0] else ",")), name)
+    return _read_columns(text, name, ";" if ";" in text.split("\n")[0] else ",")
 
 
-def _read_tsv(text: str, name: str) -> _Table:
-    return _from_rows(list(csv.reader(text.splitlines(), delimiter="\t")), name)
-
-
-def _from_rows(rows: list[list[str]], name: str) -> _Table:
-    rows = [row for row in rows if any(cell.strip() for cell in row)]
+def _read_columns(text: str, name: str, separator: str) -> _Table:
+    rows = [row for row in csv.reader(text.splitlines(), delimiter=separator) if any(cell.strip() for cell in row)]
     for k, row in enumerate(rows):
         titles = [cell.strip().lstrip("#").strip().lower() for cell in row]
         if axes := _axes(titles):
@@ -283,7 +279,7 @@ def _require_mm(markup: dict[str, Any], name: str) -> None:
 
 _READERS: dict[str, Callable[[str, str], _Table]] = {
     ".csv": _read_csv,
-    ".tsv": _read_tsv,
+    ".tsv": lambda text, name: _read_columns(text, name, "\t"),
     ".txt": _read_elastix,
     ".fcsv": _read_fcsv,
     ".json": _read_markups,

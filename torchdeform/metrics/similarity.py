@@ -114,6 +114,11 @@ def similarity_weights(similarity: str | Mapping[str, float]) -> dict[str, float
     return weights
 
 
+def measure_name(similarity: str | Mapping[str, float]) -> str:
+    """Return the names of the measures that a setting ``similarity`` names, as one text: ``lncc + mi``."""
+    return " + ".join(similarity_weights(similarity))
+
+
 def measures_in(similarity: str | Mapping[str, float]) -> dict[str, Measure]:
     """Return the rows of the measures that a setting ``similarity`` names; `InputError` as `similarity_weights`."""
     return {name: MEASURES[name] for name in similarity_weights(similarity)}

@@ -27,7 +27,6 @@ _STATUS = Path("/proc/self/status")
 # Limit and use of a control group, by its version's file names.
 _LIMITS = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
 
-
 # Measured by ``scripts/benchmarks/memory.py``: bytes of a process that has imported everything; and per node of the
 # fixed grid, whatever the similarity, by dimension. To these come those of `Measure.memory` per node and channel.
 _PROCESS_BYTES = 4.5e8
@@ -162,7 +161,7 @@ def fitting_grid(grid: Grid, limit: int, channels: int, settings: RegistrationSe
     if limit < least:
         raise InputError(
             f"--memory {readable(limit, spaced=False)} is too little for a fixed image of "
-            f"{'×'.join(map(str, grid.shape[::-1]))}: give at least {readable(least, spaced=False)}, or resample it"
+            f"{grid.size_text}: give at least {readable(least, spaced=False)}, or resample it"
         )
     size, coarser = min(grid.spacing), grid
     while footprint(coarser, channels, settings) > limit and max(coarser.shape) > MIN_NODES:

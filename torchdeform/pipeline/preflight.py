@@ -157,10 +157,8 @@ def _check_values(image: Image) -> Iterator[Finding]:
 
 def _check_nodes(image: Image, severity: str) -> Iterator[Finding]:
     if min(image.grid.shape) < MIN_NODES:
-        text = (
-            f"{image.name} has the size {_size(image.grid)}; every axis needs at least {MIN_NODES} voxels: resample it"
-        )
-        yield Finding(severity, text)
+        text = f"{image.name} has the size {image.grid.size_text}; every axis needs at least {MIN_NODES} voxels"
+        yield Finding(severity, f"{text}: resample it")
 
 
 def _check_spacing(image: Image, partner: Image) -> Iterator[Finding]:
@@ -262,14 +260,10 @@ def _check_memory(fixed: Image, settings: RegistrationSettings) -> Iterator[Find
     if room is None or need < 0.8 * room:
         return
     text = (
-        f"registration at {_size(fixed.grid)} takes about {readable(need)} of memory and {readable(room)} are free; "
+        f"registration at {fixed.grid.size_text} takes about {readable(need)} of memory and {readable(room)} are free; "
         f"give --memory {readable(room, spaced=False)} to stop at a coarser level, or crop {fixed.name}"
     )
     yield Finding(ERROR if need > 1.25 * room else WARNING, text)
-
-
-def _size(grid: Grid) -> str:
-    return "×".join(map(str, grid.shape[::-1]))
 
 
 def _check_mask(image: Image, mask: Image) -> Iterator[Finding]:

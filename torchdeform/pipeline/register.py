@@ -15,8 +15,7 @@ from torchdeform.core.transform import Transform
 from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.io import read_image, write_displacement, write_image, write_transform
 from torchdeform.io.files import atomic_folder, require_writable
-from torchdeform.io.images import ending_like, read_optional
-from torchdeform.io.labels import read_labels, write_labels
+from torchdeform.io.images import ending_like, read_labels, read_optional, write_labels
 from torchdeform.io.points import matched, read_points
 from torchdeform.metrics.evaluation import common_labels
 from torchdeform.pipeline.memory import available, fitting_grid, footprint, peak, readable
@@ -25,10 +24,9 @@ from torchdeform.registration.deformable import resample_result
 from torchdeform.registration.problem import Guidance
 from torchdeform.registration.result import Callback, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.report.command_lines import repeat_command
 from torchdeform.report.figures import write_overview
 from torchdeform.report.page import write_report
-from torchdeform.report.record import describe, write_json
+from torchdeform.report.record import describe, repeat_command, write_json
 from torchdeform.report.report_data import make_report_data
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -61,6 +59,10 @@ class PairFiles:
     moving_points: Path | None = None
     fixed_labels: Path | None = None
     moving_labels: Path | None = None
+
+    def given(self) -> dict[str, Path]:
+        """Return the files that are given, and the folder ``out``, by their names here."""
+        return {field.name: path for field in fields(self) if (path := getattr(self, field.name)) is not None}
 
     def require_pairs(self) -> None:
         """Raise `InputError` if points or labels are given for one image only."""
@@ -220,7 +222,7 @@ def _fit_to_memory(
     grid = fitting_grid(fixed.grid, memory, channels, settings)
     if grid == fixed.grid:
         return fixed, ()
-    sizes = " instead of ".join("×".join(map(str, g.shape[::-1])) for g in (grid, fixed.grid))
+    sizes = f"{grid.size_text} instead of {fixed.grid.size_text}"
     note = f"to stay below {readable(memory)} of memory the finest level has {sizes} nodes"
     return replace(fixed, data=restrict(fixed.data, fixed.grid, grid), grid=grid), (note,)
 
@@ -252,7 +254,7 @@ def _write_results(files: PairFiles, inputs: Inputs, result: RegistrationResult,
 
 def _record(files: PairFiles, inputs: Inputs, result: RegistrationResult, run: _Run) -> dict[str, Any]:
     """Return the record of a result, with the files and the figures of the run."""
-    given = {f.name: str(path) for f in fields(files) if (path := getattr(files, f.name)) is not None}
+    given = {name: str(path) for name, path in files.given().items()}
     device = result.displacement.device.type
     return describe(result, inputs.fixed, inputs.moving) | {
         "inputs": given,

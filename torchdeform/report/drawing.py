@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchdeform.metrics.similarity import similarity_weights
+from torchdeform.metrics.similarity import measure_name
 from torchdeform.registration.result import RegistrationResult
 from torchdeform.report.planes import Plane
 
@@ -171,9 +171,7 @@ def draw_convergence(axes: "Axes", result: RegistrationResult, *, item: int = 0)
         marker = "o-" if len(values) == 1 else "-"  # a single point makes no line
         axes.plot(range(start, start + len(values)), values, marker, label=size, linewidth=1.6, color=colour)
         start += max(len(values) - 1, 0)
-    axes.set_xlabel("step", fontsize=9, color=INK)
-    axes.set_ylabel(measure_name(result), fontsize=9, color=INK)
-    _plain(axes)
+    _name_axes(axes, "step", measure_name(result.settings.similarity.measure))
     if result.levels:
         axes.legend(fontsize=8, frameon=False, loc="best")
 
@@ -190,19 +188,14 @@ def draw_volumes(axes: "Axes", counts: Tensor, limit: float) -> None:
     axes.axvline(0, color=INK, linewidth=0.8, linestyle=":")
     axes.set_xlim(-limit, limit)
     axes.set_xticks([value for value, _ in scale.ticks], labels=[text for _, text in scale.ticks])
-    axes.set_xlabel("volume: moving / fixed", fontsize=9, color=INK)
-    axes.set_ylabel("% of voxels", fontsize=9, color=INK)
-    _plain(axes)
+    _name_axes(axes, "volume: moving / fixed", "% of voxels")
 
 
-def _plain(axes: "Axes") -> None:
+def _name_axes(axes: "Axes", across: str, down: str) -> None:
+    axes.set_xlabel(across, fontsize=9, color=INK)
+    axes.set_ylabel(down, fontsize=9, color=INK)
     axes.tick_params(labelsize=8, colors=INK)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def measure_name(result: RegistrationResult) -> str:
-    """Return the name of the similarity, or of several."""
-    return " + ".join(similarity_weights(result.settings.similarity.measure))
 
 
 def tinted(first: Floats, second: Floats) -> Floats:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from torch import Tensor
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, box_corners
 from torchdeform.core.warp import sample
+from torchdeform.metrics.similarity import measure_name
 from torchdeform.report.drawing import (
     INK,
     difference_scale,
@@ -23,7 +25,6 @@ from torchdeform.report.drawing import (
     draw_lines,
     draw_map,
     frame,
-    measure_name,
     new_figure,
     save_png,
     tinted,
@@ -41,6 +42,11 @@ if TYPE_CHECKING:
 _SHEET = {2: (2, 4), 3: (3, 7)}  # rows and columns of panels
 _PANEL_INCHES = {2: 3.2, 3: 2.3}
 _GRID_LINES = {2: 36, 3: 24}
+_GALLERY_INCHES = {2: 3.2, 3: 2.2}
+_OUTLINES = ("#0b5fa5", "#b34700")
+_OVERLAY_INCHES = 3.0
+_PIXELS = 400  # along the longer side of an overlay
+_FARTHEST = 3.0  # width of an overlay at most, in widths of the fixed image
 
 Draw = Callable[["Axes", ReportData, Slices], None]
 
@@ -64,7 +70,7 @@ def write_overview(path: Path, data: ReportData) -> None:
         axes.set_title(_title(title, result) if cuts is data.slices[0] else "", fontsize=10, color=INK)
     for axes in cells:  # the last one, in 2D
         draw_convergence(axes, result)
-        axes.set_title(f"{measure_name(result)} over the steps", fontsize=10, color=INK)
+        axes.set_title(f"{measure_name(result.settings.similarity.measure)} over the steps", fontsize=10, color=INK)
         axes.set_ylabel("")
         axes.set_box_aspect(shapes[0])
     figure.suptitle(_headline(result), fontsize=11, color=INK)
@@ -86,25 +92,19 @@ def _headline(result: "RegistrationResult") -> str:
     diagnosis = result.diagnosis
     before, after = result.similarity_before.item(), result.similarity_after.item()
     return (
-        f"{measure_name(result)} {before:.3g} → {after:.3g}     "
+        f"{measure_name(result.settings.similarity.measure)} {before:.3g} → {after:.3g}     "
         f"folds {int(diagnosis.folds.item())}     "
         f"determinant {diagnosis.det_min.item():.2g} to {diagnosis.det_max.item():.2g}     "
-        f"inverse error {result.inverse_error_mean.item():.2g} voxel"
+        f"inverse consistency {result.inverse_error_mean.item():.2g} voxel"
     )
 
 
-def _draw_image(name: str) -> Draw:
-    def draw(axes: "Axes", data: ReportData, cuts: Slices) -> None:
-        draw_image(axes, cuts.plane, cuts.fields[name][cuts.middle])
-
-    return draw
+def _draw_image(name: str, axes: "Axes", data: ReportData, cuts: Slices) -> None:
+    draw_image(axes, cuts.plane, cuts.fields[name][cuts.middle])
 
 
-def _draw_difference(name: str) -> Draw:
-    def draw(axes: "Axes", data: ReportData, cuts: Slices) -> None:
-        draw_map(axes, cuts.plane, cuts.fields[name][cuts.middle], difference_scale(data.limits[name]), bar=False)
-
-    return draw
+def _draw_difference(name: str, axes: "Axes", data: ReportData, cuts: Slices) -> None:
+    draw_map(axes, cuts.plane, cuts.fields[name][cuts.middle], difference_scale(data.limits[name]), bar=False)
 
 
 def _draw_grid(axes: "Axes", data: ReportData, cuts: Slices) -> None:
@@ -118,17 +118,14 @@ def _draw_volume(axes: "Axes", data: ReportData, cuts: Slices) -> None:
 
 
 _PANELS: dict[str, Draw] = {
-    "fixed": _draw_image("fixed"),
-    "moving": _draw_image("moving"),
-    "warped": _draw_image("warped"),
+    "fixed": partial(_draw_image, "fixed"),
+    "moving": partial(_draw_image, "moving"),
+    "warped": partial(_draw_image, "warped"),
     "deformed grid": _draw_grid,
-    "difference before": _draw_difference("before"),
-    "difference after": _draw_difference("after"),
+    "difference before": partial(_draw_difference, "before"),
+    "difference after": partial(_draw_difference, "after"),
     "volume: moving / fixed": _draw_volume,
 }
-
-
-_GALLERY_INCHES = {2: 3.2, 3: 2.2}  # width of a panel
 
 
 def write_gallery(path: Path, images: Mapping[str, Image]) -> None:
@@ -148,12 +145,6 @@ def write_gallery(path: Path, images: Mapping[str, Image]) -> None:
             draw_image(cells[row, column], plane, plane.cut(to_unit(values, values), [plane.middle])[0])
         cells[0, column].set_title(title, fontsize=10, color=INK)
     save_png(figure, path)
-
-
-_OUTLINES = ("#0b5fa5", "#b34700")
-_OVERLAY_INCHES = 3.0
-_PIXELS = 400  # along the longer side of a picture
-_FARTHEST = 3.0  # width of the picture at most, in widths of the fixed image
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,8 @@ def write_grids(path: Path, grids: Mapping[str, Tensor], picture: Tensor | None 
         axes = figure.add_subplot(1, panels, 1)
         draw_picture(axes, picture, next(iter(grids.values())), "image")
     for place, (title, points) in enumerate(grids.items(), start=1 + panels - len(grids)):
-        _PAINTERS[dim](figure, (1, panels, place), points, title)
+        axes: Any = figure.add_subplot(1, panels, place, projection="3d" if dim == 3 else None)
+        (draw_cutaway if dim == 3 else draw_plane)(axes, points, title)
     _share_limits(figure)
     drawing.save_png(figure, path)
 
@@ -100,17 +101,6 @@ def _share_limits(figure: "Figure") -> None:
         first, last = (min, max) if starts[0] < stops[0] else (max, min)
         for axes in planes:
             getattr(axes, f"set_{name}")(first(starts), last(stops))
-
-
-def _plane(figure: "Figure", place: tuple[int, int, int], points: Tensor, title: str) -> None:
-    draw_plane(figure.add_subplot(*place), points, title)
-
-
-def _space(figure: "Figure", place: tuple[int, int, int], points: Tensor, title: str) -> None:
-    draw_cutaway(figure.add_subplot(*place, projection="3d"), points, title)  # pyright: ignore[reportArgumentType]
-
-
-_PAINTERS = {2: _plane, 3: _space}
 
 
 def _nodes(points: Tensor, dim: int) -> Nodes:

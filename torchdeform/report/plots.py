@@ -176,9 +176,8 @@ def plot_determinant(u: Tensor, space: Image | Grid, *, limit: float | None = No
     if limit is not None and not limit > 1:
         raise InputError(f"limit: the largest determinant of the scale must be above 1, got {limit}")
     place = _place(space)
-    values = _log_determinant(u, place.grid)
-    scale = drawing.volume_scale(_volume_limit(values) if limit is None else math.log(limit))
-    return _plot_map(values, place, scale, **view)
+    values, reach = _log_determinant(u, place.grid)
+    return _plot_map(values, place, drawing.volume_scale(reach if limit is None else math.log(limit)), **view)
 
 
 def plot_divergence(u: Tensor, space: Image | Grid, *, limit: float | None = None, **view: Unpack[View]) -> "Axes":
@@ -260,8 +259,7 @@ def plot_volume_histogram(u: Tensor, space: Image | Grid, *, axes: "Axes | None"
     Raises:
         InputError: shape of u.
     """
-    values, axes = _log_determinant(u, _place(space).grid), _axes(axes)
-    limit = _volume_limit(values)
+    (values, limit), axes = _log_determinant(u, _place(space).grid), _axes(axes)
     drawing.draw_volumes(axes, volume_counts(values, limit), limit)
     return axes
 
@@ -333,12 +331,10 @@ def _limit(values: Tensor, limit: float | None) -> float:
     return limit
 
 
-def _log_determinant(u: Tensor, grid: Grid) -> Tensor:
-    return log_volume(jacobian_determinant(u.detach().cpu(), grid))
-
-
-def _volume_limit(values: Tensor) -> float:
-    return end_of_scale(values, math.log(2))
+def _log_determinant(u: Tensor, grid: Grid) -> tuple[Tensor, float]:
+    """Return log J and where its scale ends."""
+    values = log_volume(jacobian_determinant(u.detach().cpu(), grid))
+    return values, end_of_scale(values, math.log(2))
 
 
 def _plot_map(values: Tensor, place: Image, scale: drawing.Scale, **view: Unpack[View]) -> "Axes":

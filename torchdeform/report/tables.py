@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchdeform.metrics.similarity import similarity_weights
-from torchdeform.report.command_lines import apply_commands
+from torchdeform.metrics.similarity import measure_name
+from torchdeform.report.record import apply_commands
 from torchdeform.report.verdict import ends, number, value
 
 _LONG = 12  # a table with more rows is folded
@@ -55,7 +55,6 @@ def file_name(place: Mapping[str, Any]) -> str:
 
 def tiles(record: Record) -> list[Tile]:
     """Return the most important figures."""
-    measure = " + ".join(similarity_weights(record["similarity"]))
     frames = {2: 4, 3: 10}[len(record["fixed"]["size"])]
     low, high = number(record["determinant_min"]), number(record["determinant_max"])
     return [
@@ -65,7 +64,7 @@ def tiles(record: Record) -> list[Tile]:
             f"voxels where one of the {frames} one-sided determinants is not positive",
         ),
         Tile(
-            f"Similarity ({measure})",
+            f"Similarity ({measure_name(record['similarity'])})",
             f"{number(record['similarity_before'])} → {number(record['similarity_after'])}",
             "before → after the deformation; higher is better",
         ),
@@ -107,19 +106,23 @@ def tables(record: Record) -> list[Table]:
     return [table for table in found if table is not None]
 
 
-def _measures(record: Record) -> dict[str, Mapping[str, Any]]:
-    """Return the measures of labels and landmarks by stage, as far as known."""
+def _measures(record: Record, key: str) -> dict[str, Mapping[str, Any]]:
+    """Return the measures of labels and landmarks by stage, of the stages that have the key."""
     found = record.get("evaluation", {})
-    return {stage: found[stage] for stage in _STAGES if stage in found}
+    return {stage: found[stage] for stage in _STAGES if key in found.get(stage, {})}
 
 
 def _labels(record: Record) -> Table | None:
-    stages = {stage: m for stage, m in _measures(record).items() if "dice" in m}
+    stages = _measures(record, "dice")
     if not stages:
         return None
     after = stages["after"]["dice"]
     rows = [
-        [label, *(number(m["dice"][label]) for m in stages.values()), *_far(stages, label)]
+        [
+            label,
+            *(number(m["dice"][label]) for m in stages.values()),
+            *(number(stages[end]["hausdorff_95"][label]) for end in ("before", "after")),
+        ]
         for label in sorted(after, key=lambda label: value(after[label]) if math.isfinite(value(after[label])) else 2.0)
     ]
     means = " → ".join(f"{number(m['dice_mean'])} {stage}" for stage, m in stages.items())
@@ -131,12 +134,8 @@ def _labels(record: Record) -> Table | None:
     return Table("Labels", [_foldable(head, rows, f"All {len(rows)} labels")], summary)
 
 
-def _far(stages: Mapping[str, Mapping[str, Any]], label: str) -> list[str]:
-    return [number(stages[stage]["hausdorff_95"][label]) for stage in ("before", "after")]
-
-
 def _landmarks(record: Record) -> Table | None:
-    stages = {stage: m for stage, m in _measures(record).items() if "landmark_errors" in m}
+    stages = _measures(record, "landmark_errors")
     if not stages:
         return None
     head = ["distance in mm", *stages]

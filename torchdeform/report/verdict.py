@@ -46,7 +46,7 @@ def judge(record: Record) -> Verdict:
     Notes:
         No figure proves that the right tissue is on the right tissue. Only labels, landmarks or a look can show it.
     """
-    found = [_folds(record), _similarity(record), *_labels(record), *_landmarks(record), *_map(record)]
+    found = [_folds(record), *_similarity(record), *_labels(record), *_landmarks(record), *_map(record)]
     found += [Finding(DOUBTFUL, f"Warning: {text}") for text in record.get("warnings", ())]
     found.sort(key=lambda finding: (BAD, DOUBTFUL, GOOD).index(finding.kind))
     return Verdict(found[0].kind, _HEADLINES[found[0].kind], tuple(found))
@@ -59,41 +59,39 @@ def _folds(record: Record) -> Finding:
     return Finding(BAD, f"The map folds at {folds:,} voxel{'s' if folds > 1 else ''}: it cannot be inverted there.")
 
 
-def _similarity(record: Record) -> Finding:
+def _similarity(record: Record) -> list[Finding]:
     before, after = (value(record[f"similarity_{when}"]) for when in ("before", "after"))
     if not (math.isfinite(before) and math.isfinite(after)):
-        return Finding(BAD, "The similarity is not a number: the images could not be compared.")
+        return [Finding(BAD, "The similarity is not a number: the images could not be compared.")]
     change = (after - before) / max(abs(before), abs(after), 1e-12)
-    figures = f"{number(before)} → {number(after)}, higher is better"
-    if abs(change) < _STEADY:
-        return Finding(DOUBTFUL, f"The deformation hardly changed the similarity ({figures}).")
-    if change < 0:
-        return Finding(BAD, f"The images are less similar than before the deformation ({figures}).")
-    return Finding(GOOD, f"The deformation made the images more similar ({figures}).")
+    figures = f"({number(before)} → {number(after)}, higher is better)"
+    worse = f"The images are less similar than before the deformation {figures}."
+    same = f"The deformation hardly changed the similarity {figures}."
+    return _graded(change, _STEADY, worse, same, f"The deformation made the images more similar {figures}.")
 
 
 def _labels(record: Record) -> list[Finding]:
     before, after = ends(record, "dice_mean")
-    if not math.isfinite(before + after):
-        return []
     figures = f"mean Dice {number(before)} → {number(after)}"
-    if after < before - _STEADY:
-        return [Finding(BAD, f"The labels overlap less than before ({figures}).")]
-    if after < before + _STEADY:
-        return [Finding(DOUBTFUL, f"The labels overlap no better than before ({figures}).")]
-    return [Finding(GOOD, f"The labels overlap better than before ({figures}; 1 is perfect).")]
+    words = (f"less than before ({figures})", f"no better than before ({figures})")
+    best = f"better than before ({figures}; 1 is perfect)"
+    return _graded(after - before, _STEADY, *(f"The labels overlap {word}." for word in (*words, best)))
 
 
 def _landmarks(record: Record) -> list[Finding]:
     before, after = ends(record, "landmark_error_mean")
-    if not math.isfinite(before + after):
+    figures = f"(mean distance {number(before)} → {number(after)} mm)"
+    words = ("farther apart than", "no nearer than", "nearer than")
+    return _graded(before - after, _STEADY * before, *(f"The landmarks are {word} before {figures}." for word in words))
+
+
+def _graded(gain: float, steady: float, worse: str, same: str, better: str) -> list[Finding]:
+    """Return what one of three sentences says about a gain; below ``steady`` it does not count, NaN has none."""
+    if not math.isfinite(gain):
         return []
-    figures = f"mean distance {number(before)} → {number(after)} mm"
-    if after > before * (1 + _STEADY):
-        return [Finding(BAD, f"The landmarks are farther apart than before ({figures}).")]
-    if after > before * (1 - _STEADY):
-        return [Finding(DOUBTFUL, f"The landmarks are no nearer than before ({figures}).")]
-    return [Finding(GOOD, f"The landmarks are nearer than before ({figures}).")]
+    if gain < -steady:
+        return [Finding(BAD, worse)]
+    return [Finding(DOUBTFUL, same) if gain < steady else Finding(GOOD, better)]
 
 
 def _map(record: Record) -> list[Finding]:

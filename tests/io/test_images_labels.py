@@ -9,7 +9,7 @@ import torch
 from broken_files import SHAPE, Make, bytes_of, itk_image, refused, save
 
 from torchdeform.io import read_image, write_image
-from torchdeform.io.labels import read_labels
+from torchdeform.io.images import read_labels
 from torchdeform.metrics.evaluation import dice
 
 

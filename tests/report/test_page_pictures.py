@@ -8,7 +8,7 @@ import torch
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.report import make_report_data, write_report
-from torchdeform.report.pictures import fitting_pictures
+from torchdeform.report.page import fitting_pictures
 from torchdeform.report.record import describe
 
 
@@ -29,7 +29,7 @@ def test_pictures_are_made_smaller_where_they_would_not_fit(make_image, make_res
     report_data = make_report_data(fixed, fixed, make_result(fixed, fixed))
     sizes = []
     for most in (10**9, 10**5, 0):
-        monkeypatch.setattr("torchdeform.report.pictures._MOST", most)
+        monkeypatch.setattr("torchdeform.report.page._MOST", most)
         found = fitting_pictures(report_data)
         sizes.append(sum(picture.size for group in found["groups"].values() for picture in group))  # type: ignore
     assert sizes[0] > sizes[1] >= sizes[2] > 0

@@ -9,7 +9,7 @@ from nested_settings import settings_of
 from torchdeform.pipeline.config import load_settings, parse_override, preset_names
 from torchdeform.pipeline.memory import parse_size
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.report.command_lines import apply_commands, changed, repeat_command
+from torchdeform.report.record import apply_commands, changed, repeat_command
 
 FILES = {"fixed": "a b.png", "moving": "it's.png", "out": "$HOME", "fixed_points": "p.csv"}
 

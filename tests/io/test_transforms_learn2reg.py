@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchdeform.io import write_image
-from torchdeform.io.learn2reg import voxel_displacement, write_voxel_displacement
+from torchdeform.io.transforms import voxel_displacement, write_voxel_displacement
 
 
 def _pair(make_image, dim):
