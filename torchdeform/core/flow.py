@@ -127,7 +127,7 @@ def flow(v: Tensor, grid: Grid, solver: OdeSolver, *, time: float = 1.0) -> Tens
         return torch.zeros_like(v)
     if solver.method == "squaring":
         return _square(v * (time / 2**solver.steps), grid, solver.steps)
-    velocity, nodes = (v if time > 0 else -v), torch.zeros_like(v)
+    velocity, nodes = (v if time > 0 else -v), v.new_zeros(()).expand_as(v)  # zeros that take no memory
 
     def rate(_: Any, u: Tensor) -> Tensor:
         return velocity if u is nodes else warp(velocity, u, grid)
