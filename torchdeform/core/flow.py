@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import compose, keep_inside, warp
-from torchdeform.errors import ComputationError, InputError, require_choice
+from torchdeform.errors import WHOLE, ComputationError, InputError, require_choice, require_ranges
 
 # What moves the state: (time, state) -> its rate of change; time is a scalar tensor, or a number while tracing.
 Rate = Callable[[Any, Tensor], Tensor]
@@ -73,10 +73,8 @@ class OdeSolver:
 
     def __post_init__(self) -> None:
         require_choice(self.method, METHODS, "integrate: method")
-        if not isinstance(self.steps, int) or self.steps < 1:
-            raise InputError(f"integrate: steps must be a whole number, at least 1, got {self.steps!r}")
-        if not (math.isfinite(self.atol) and self.atol > 0):
-            raise InputError(f"integrate: atol must be a positive number of voxels, got {self.atol!r}")
+        voxels = (lambda x: 0 < x < math.inf, "be a positive number of voxels")
+        require_ranges(self, "integrate: ", steps=WHOLE, atol=voxels)
         if self.adjoint and self.method == "squaring":
             raise InputError("integrate: squaring has no adjoint equation; take method='rk4'")
 

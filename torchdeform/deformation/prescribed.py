@@ -13,7 +13,7 @@ from torchdeform.core.fold_free import largest_share
 from torchdeform.core.grid import Grid, per_item
 from torchdeform.deformation.finite_differences import Differences
 from torchdeform.deformation.monitors import require_positive
-from torchdeform.errors import InputError, require_choice
+from torchdeform.errors import AT_LEAST_0, AT_LEAST_1, InputError, require_choice, require_ranges
 from torchdeform.fem.boundary import fixed_unknowns
 from torchdeform.fem.div_curl import solve_div_curl
 from torchdeform.solvers.base import Solution, Status
@@ -52,8 +52,7 @@ class NewtonSettings:
     linear_steps: int = 500
 
     def __post_init__(self) -> None:
-        if (self.rtol or 0) < 0 or self.max_steps < 0 or self.linear_steps < 1:
-            raise InputError("NewtonSettings: rtol and max_steps must not be negative, linear_steps at least 1")
+        require_ranges(self, "NewtonSettings: ", rtol=AT_LEAST_0, max_steps=AT_LEAST_0, linear_steps=AT_LEAST_1)
 
 
 @dataclass(frozen=True)
@@ -296,7 +295,7 @@ class _Descent:
         slope = adjoint(now.left, factors)
         # CG has one tolerance for all items: each is scaled so that it is 1.
         unit = (self._forcing(now, index) * dots(slope, slope).sqrt()).clamp(min=torch.finfo(slope.dtype).tiny)
-        unit = unit.view(-1, *[1] * (slope.dim() - 1))
+        unit = per_item(unit, slope)
         solution = conjugate_gradient(
             lambda v: adjoint(rows(v, factors), factors),
             slope / unit,

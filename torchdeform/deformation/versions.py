@@ -25,7 +25,7 @@ from torchdeform.core.warp import max_voxels, sample
 from torchdeform.deformation.corrections import correct_determinant
 from torchdeform.deformation.monitors import mean_value, normalise_monitor, require_positive
 from torchdeform.deformation.velocity import VelocityName, find_velocity
-from torchdeform.errors import ComputationError, InputError
+from torchdeform.errors import ComputationError, InputError, require_ranges
 from torchdeform.fem.boundary import fixed_unknowns
 
 # A monitor in time: t -> f (B, 1, *S), or its values at the times asked for, (T, B, 1, *S).
@@ -51,8 +51,8 @@ class DeformationSettings:
     remove_folds: bool = True
 
     def __post_init__(self) -> None:
-        if not isinstance(self.corrections, int) or self.corrections < 0:
-            raise InputError(f"DeformationSettings: corrections must be 0 or more, got {self.corrections!r}")
+        count = (lambda x: isinstance(x, int) and x >= 0, "be 0 or more")
+        require_ranges(self, "DeformationSettings: ", corrections=count)
 
 
 _STILL = DeformationSettings()

@@ -11,7 +11,7 @@ from torchdeform.core.flow import OdeSolver, integrate_rate
 from torchdeform.core.grid import Grid, per_item
 from torchdeform.core.resampling import prolong
 from torchdeform.core.warp import warp
-from torchdeform.errors import InputError
+from torchdeform.errors import AT_LEAST_1, BETWEEN_0_AND_1, POSITIVE, InputError, require_ranges
 from torchdeform.nn.operators import div_curl_velocity, share_within_bounds
 from torchdeform.nn.precision import full_precision
 
@@ -60,12 +60,10 @@ class JacobianCurlHead(nn.Module):
         least: float = 0.01,
     ) -> None:
         super().__init__()
-        if not (1 < ratio < math.inf and 0 < curl < math.inf and steps >= 1 and 0 < least < 1):
-            raise InputError(
-                "JacobianCurlHead: ratio must be above 1, curl positive, steps at least 1, least between 0 and 1, got "
-                f"{ratio}, {curl}, {steps}, {least}"
-            )
         self.grid, self.ratio, self.curl, self.steps, self.least = grid, ratio, curl, steps, least
+        above_1 = (lambda x: 1 < x < math.inf, "be finite and above 1")
+        ranges = {"ratio": above_1, "curl": POSITIVE, "steps": AT_LEAST_1, "least": BETWEEN_0_AND_1}
+        require_ranges(self, "JacobianCurlHead: ", **ranges)
         self.conv = _CONV[grid.dim](channels, 1 + len(CURL_PAIRS[grid.dim]), 3, padding=1)
         nn.init.normal_(self.conv.weight, std=_FIRST_WEIGHTS)
         nn.init.zeros_(self.conv.bias)

@@ -15,7 +15,7 @@ from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Transform, place_of
 from torchdeform.core.warp import compose, invert, max_voxels
 from torchdeform.deformation.averages import average_maps
-from torchdeform.errors import ComputationError, InputError, require_choice
+from torchdeform.errors import AT_LEAST_0, AT_LEAST_1, ComputationError, InputError, require_choice, require_ranges
 from torchdeform.registration.deformable import register
 from torchdeform.registration.result import Callback
 from torchdeform.registration.settings import RegistrationSettings
@@ -72,10 +72,8 @@ class AveragingSettings:
 
     def __post_init__(self) -> None:
         require_choice(self.pose, get_args(Pose), "pose")
-        if self.corrections < 1:
-            raise InputError(f"corrections must be at least 1, got {self.corrections}")
-        if not self.tolerance >= 0:
-            raise InputError(f"tolerance must be a number of voxels, not negative, got {self.tolerance}")
+        voxels = (AT_LEAST_0[0], "be a number of voxels, not negative")
+        require_ranges(self, "", corrections=AT_LEAST_1, tolerance=voxels)
 
 
 _DEFAULT = AveragingSettings()
