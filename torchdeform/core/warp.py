@@ -220,25 +220,21 @@ def invert(
         w = _find_inverse(u, grid, atol, max_steps)
     if u.requires_grad:
         with torch.no_grad():
-            inverse = _inverse_jacobian(u, grid)
+            inverse = inverse_matrix(map_jacobian(u, grid))
+            inverse = warp(inverse.flatten(1, 2), w, grid).view(inverse.shape)
         moved = warp(u, w, grid)
-        w = w - _times(warp(inverse, w, grid), moved - moved.detach())  # w as it is, with δw = −∇φ⁻¹ δu(x + w)
+        w = w - matrix_times(inverse, moved - moved.detach())  # w as it is, with δw = −∇φ⁻¹ δu(x + w)
     return (w, max_voxels(compose(u, w, grid), grid)) if return_error else w
 
 
-def _inverse_jacobian(u: Tensor, grid: Grid) -> Tensor:
-    """Return (∇φ)⁻¹ at the nodes, row after row, as ``(B, D·D, *S)``; finite also where φ folds."""
-    return _inverted(map_jacobian(u, grid))
+def inverse_matrix(matrix: Tensor) -> Tensor:
+    """Return the inverse of ``(B, D, D, *T)``, finite: a small determinant counts as one a little larger."""
+    return cofactors(matrix).transpose(1, 2) / determinant(matrix).clamp(min=_SMALLEST_DETERMINANT).unsqueeze(1)
 
 
-def _inverted(matrix: Tensor) -> Tensor:
-    """Return the inverse of ``(B, D, D, *T)``, row after row, a small determinant counting as one a little larger."""
-    inverse = cofactors(matrix).transpose(1, 2) / determinant(matrix).clamp(min=_SMALLEST_DETERMINANT).unsqueeze(1)
-    return inverse.flatten(1, 2)
-
-
-def _times(rows: Tensor, vector: Tensor) -> Tensor:
-    return (rows.unflatten(1, (-1, vector.shape[1])) * vector.unsqueeze(1)).sum(dim=2)
+def matrix_times(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Return the products of ``(B, D, D, *T)`` with ``(B, D, *T)``."""
+    return (matrix * vector.unsqueeze(1)).sum(dim=2)
 
 
 def _find_inverse(u: Tensor, grid: Grid, atol: float, max_steps: int) -> Tensor:
@@ -344,9 +340,9 @@ def _newton(u: Tensor, grid: Grid, nodes: Tensor, w: Tensor, atol: float, max_st
 def _few_steps(u: Tensor, grid: Grid, nodes: Tensor, state: tuple[Tensor, ...], atol: float) -> tuple[Tensor, ...]:
     """Return w, its defect, its error and the fraction of a step to try, after steps with one ∇φ⁻¹."""
     w, defect, error, fraction = state
-    rows = _inverse_jacobian_at(u, (nodes + 1) * (_column(grid.extent, w) / 2) + w, grid)
+    inverse = inverse_matrix(jacobian_at(u, (nodes + 1) * (_column(grid.extent, w) / 2) + w, grid))
     for _ in range(_REFRESH):
-        trial = w - fraction * _times(rows, defect)
+        trial = w - fraction * matrix_times(inverse, defect)
         trial_defect = trial + _from_nodes(u, nodes, trial, grid)
         trial_error = _lengths(trial_defect, grid)
         active = error > atol
@@ -357,8 +353,8 @@ def _few_steps(u: Tensor, grid: Grid, nodes: Tensor, state: tuple[Tensor, ...], 
     return w, defect, error, fraction
 
 
-def _inverse_jacobian_at(u: Tensor, points: Tensor, grid: Grid) -> Tensor:
-    """Return (∇φ)⁻¹ at points of Ω, row after row, from differences over one voxel to either side."""
+def jacobian_at(u: Tensor, points: Tensor, grid: Grid) -> Tensor:
+    """Return ∇φ ``(B, D, D, *T)`` at points ``(B, D, *T)`` of Ω from differences over one voxel to either side."""
     columns = []
     for axis, (h, length) in enumerate(zip(grid.spacing, grid.extent, strict=True)):
         ends = [points.clone(), points.clone()]
@@ -366,7 +362,7 @@ def _inverse_jacobian_at(u: Tensor, points: Tensor, grid: Grid) -> Tensor:
         ends[1][:, axis] = (points[:, axis] + h).clamp(h, length)
         moved = [end + sample(u, end, grid) for end in ends]
         columns.append((moved[1] - moved[0]) / (ends[1] - ends[0])[:, axis : axis + 1])
-    return _inverted(torch.stack(columns, dim=2))
+    return torch.stack(columns, dim=2)
 
 
 def _from_nodes(u: Tensor, nodes: Tensor, w: Tensor, grid: Grid) -> Tensor:

@@ -190,12 +190,8 @@ class DiscreteSettings:
         require_ranges(self, "discrete.", min_determinant=BELOW_1)
 
 
-_ALIGN, _DISCRETE, _SIMILARITY, _METRIC = (
-    AlignmentSettings(),
-    DiscreteSettings(),
-    SimilaritySettings(),
-    MetricSettings(),
-)
+_ALIGN, _DISCRETE = AlignmentSettings(), DiscreteSettings()
+_SIMILARITY, _METRIC = SimilaritySettings(), MetricSettings()
 _SOLVER, _FLOW = SolverSettings(), OdeSolver(method="midpoint", steps=1)
 _OPTIMISER, _FOLDS = OptimiserSettings(), FoldSettings()
 
