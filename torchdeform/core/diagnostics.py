@@ -105,19 +105,6 @@ def _central_determinant(u: Tensor, grid: Grid) -> Tensor:
     return det
 
 
-def is_diffeomorphic(u: Tensor, grid: Grid) -> Tensor:
-    """Return for each item ``(B,)`` whether all one-sided determinants of φ = id + u are positive.
-
-    Args:
-        u: displacement ``(B, D, *S)`` in units of spacing.
-        grid: its grid.
-
-    Raises:
-        InputError: shape.
-    """
-    return smallest_determinant(u, grid) > 0
-
-
 def smallest_determinant(u: Tensor, grid: Grid) -> Tensor:
     """Return the smallest of all one-sided determinants of φ = id + u over the nodes.
 

@@ -170,12 +170,15 @@ def integrate_points(
     """
     if points.dim() < 3 or points.shape[1] != grid.dim:
         raise InputError(f"integrate_points: points must have shape (B, {grid.dim}, *T), got {tuple(points.shape)}")
-    steps = [b - a for a, b in pairwise(times)]
-    if not steps or not (all(step > 0 for step in steps) or all(step < 0 for step in steps)):
-        raise InputError(f"integrate_points: times must be two or more, increasing or decreasing, got {list(times)}")
+    require_times(times, "integrate_points")
     trajectory = integrate_rate(rate, points, times, grid, solver or OdeSolver(), parameters)
-    farthest = grid.along(grid.extent, points).view(-1, *([1] * (points.dim() - 2)))
-    return trajectory.clamp(min=0.0).clamp(max=farthest)
+    return trajectory.clamp(min=0.0).clamp(max=grid.along(grid.extent, points))
+
+
+def require_times(times: Sequence[float], where: str) -> None:
+    """Raise `InputError`, which names ``where``, unless the times are two or more, increasing or decreasing."""
+    if len(times) < 2 or list(times) not in (sorted(set(times)), sorted(set(times), reverse=True)):
+        raise InputError(f"{where}: times must be two or more, increasing or decreasing, got {list(times)}")
 
 
 def integrate_rate(
@@ -284,7 +287,7 @@ def _equal_steps(steps: int) -> Callable[[Rate, Tensor, Tensor], Tensor]:
 
 def _adaptive(start: Tensor, times: Sequence[float], grid: Grid, solver: OdeSolver) -> dict[str, Any]:
     """Return the settings of an adaptive method: the error of a step is its largest component, in voxels."""
-    spacing = grid.along(grid.spacing, start).view(-1, *([1] * (start.dim() - 2)))
+    spacing = grid.along(grid.spacing, start)
 
     def norm(x: Tensor) -> Tensor:
         return (x / spacing).abs().amax()

@@ -7,13 +7,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.core.image import Image, luminance, opaque
-from torchdeform.core.resampling import LINEAR_MODES
+from torchdeform.core.resampling import AVERAGE_POOL, LINEAR_MODES
 from torchdeform.errors import InputError
 
 # Values of one channel that its percentiles are taken from, at most.
 _SAMPLES = 2**20
-
-_POOL = {2: F.avg_pool2d, 3: F.avg_pool3d}
 
 
 def corresponding_channels(fixed: Image, moving: Image) -> tuple[Image, Image]:
@@ -55,7 +53,7 @@ def fill(image: Tensor, mask: Tensor) -> Tensor:
 def _fill(image: Tensor, known: Tensor) -> Tensor:
     if bool(known.all()):
         return image
-    pool, weight = _POOL[image.dim() - 2], known.to(image.dtype)
+    pool, weight = AVERAGE_POOL[image.dim() - 2], known.to(image.dtype)
     cell = tuple(min(2, n) for n in image.shape[2:])
     share = pool(weight, cell, ceil_mode=True)
     mean = pool(image * weight, cell, ceil_mode=True) / share.clamp(min=torch.finfo(image.dtype).tiny)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchdeform.core.derivatives import CURL_PAIRS, KERNELS, cofactors, jacobian
 from torchdeform.core.diagnostics import smallest_determinant
 from torchdeform.core.fold_free import largest_share
-from torchdeform.core.grid import Grid, per_item
+from torchdeform.core.grid import Grid, common_batch, per_item
 from torchdeform.deformation.finite_differences import Differences
 from torchdeform.deformation.monitors import require_positive
 from torchdeform.errors import AT_LEAST_0, AT_LEAST_1, InputError, require_choice, require_ranges
@@ -238,10 +238,8 @@ def _problem(f: Tensor, curl: Tensor, grid: Grid, values: Tensor | None, order: 
         raise InputError("from_jacobian_and_curl: all must be float32, or all float64, on one device")
     if not all(bool(t.isfinite().all()) for t in given):
         raise InputError("from_jacobian_and_curl: curl and boundary_displacement must be finite")
-    batch = {t.shape[0] for t in given} - {1} or {1}
-    if len(batch) > 1:
-        raise InputError(f"from_jacobian_and_curl: batch sizes must agree or be 1, got {sorted(batch)}")
-    given = [t.expand(*batch, *t.shape[1:]) for t in given]
+    batch = common_batch("from_jacobian_and_curl", *given)
+    given = [t.expand(batch, *t.shape[1:]) for t in given]
     fixed = fixed_unknowns("dirichlet", grid, f.device)
     return _Problem(Differences(grid, order), torch.cat(given[:2], dim=1), (*given[2:], None)[0], fixed)
 

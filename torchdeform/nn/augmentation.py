@@ -139,8 +139,8 @@ class RandomDeformation(nn.Module):
 
     @full_precision
     def _maps(self, noise: Tensor) -> Tensor:
-        shape = tuple(min(n, _REFINEMENT * (m - 1) + 1) for n, m in zip(self.grid.shape, noise.shape[2:], strict=True))
-        grid = Grid(shape, tuple(side / (n - 1) for side, n in zip(self.grid.extent, shape, strict=True)))
+        counts = zip(self.grid.shape, noise.shape[2:], strict=True)
+        grid = self.grid.with_shape([min(n, _REFINEMENT * (m - 1) + 1) for n, m in counts])
         noise, (low, high) = prolong(noise, grid), self.determinant
         rising = noise[:, :1].clamp(min=0) * math.log(high)
         falling = noise[:, :1].clamp(max=0) * -math.log(low)

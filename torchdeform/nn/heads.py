@@ -96,19 +96,13 @@ class JacobianCurlHead(nn.Module):
     @full_precision
     def _bounded(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         monitor = torch.exp(math.log(self.ratio) * raw[:, :1].tanh())
-        return with_mean_one(monitor, self._grid_of(raw)), self.curl * raw[:, 1:].tanh()
+        return with_mean_one(monitor, self.grid.with_shape(raw.shape[2:])), self.curl * raw[:, 1:].tanh()
 
     @full_precision
     def deform(self, f: Tensor, curl: Tensor) -> Tensor:
         """Return u from the monitor and the curl that `fields` returns; arguments and result as there."""
-        u = prolong(flow_to_monitor(f, curl, self._grid_of(f), self.steps), self.grid)
+        u = prolong(flow_to_monitor(f, curl, self.grid.with_shape(f.shape[2:]), self.steps), self.grid)
         return scale_to_bounds(u, self.grid, self.least)
-
-    def _grid_of(self, field: Tensor) -> Grid:
-        shape = tuple(field.shape[2:])
-        if shape == self.grid.shape:
-            return self.grid
-        return Grid(shape, tuple(side / (n - 1) for side, n in zip(self.grid.extent, shape, strict=True)))
 
     def extra_repr(self) -> str:
         bounds = f"ratio={self.ratio:g}, curl={self.curl:g}, steps={self.steps}, least={self.least:g}"

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchdeform.core.diagnostics import Diagnosis, diagnose, inverse_error, smallest_determinant
 from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid, limit_threads
-from torchdeform.core.image import Image, resample
+from torchdeform.core.image import Image, resample, same_place
 from torchdeform.core.resampling import MIN_NODES, prolong
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import invert, warp
@@ -181,8 +181,7 @@ def _midspace(
     settings: RegistrationSettings,
 ) -> MidSpace:
     """Return the space between two images; where they share a grid and a place it is theirs."""
-    places = [(s.image.grid, s.image.origin, s.image.direction) for s in (fixed, moving)]
-    if affine is None and places[0] == places[1]:
+    if affine is None and same_place(fixed.image, moving.image):
         return midspace_of_tensors(problem)
     space = midspace_of_images(fixed, moving, affine, common_axes(fixed.image, moving.image))
     return replace(space, problem=space.problem.scaled(settings))

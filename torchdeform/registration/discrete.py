@@ -135,10 +135,9 @@ class _Search:
 
 def _make_search(grid: Grid, level: int, reach: float, settings: DiscreteSettings) -> _Search:
     source, features = (pyramid_grids(grid, index + 1)[0] for index in (settings.levels[-1], level))
-    shape = tuple(min(n, max(3, round((n - 1) / settings.spacing) + 1)) for n in features.shape)
-    control = Grid(shape, tuple(side / (n - 1) for side, n in zip(grid.extent, shape, strict=True)))
+    control = grid.with_shape([min(n, max(3, round((n - 1) / settings.spacing) + 1)) for n in features.shape])
     steps = tuple(max(1, round(reach * min(grid.spacing) / h)) for h in features.spacing)
-    entries = math.prod(2 * r + 1 for r in steps) * math.prod(shape)
+    entries = math.prod(2 * r + 1 for r in steps) * math.prod(control.shape)
     if entries > _LARGEST_VOLUME:
         raise InputError(
             f"discrete_start: a reach of {reach:g} voxels on level {level} needs {entries:.1e} costs; "

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.warp import inverse_matrix, jacobian_at, matrix_times, sample
+from torchdeform.core.warp import inverse_matrix, jacobian_at, matrix_times, sample, voxels
 
 # Newton's steps that bring the middle points to where they belong, at first and after every step of the maps.
 _FIRST, _AGAIN = 30, 3
@@ -43,10 +43,10 @@ class LandmarkForce:
     def line_search(self, v: Tensor, grid: Grid) -> Tensor:
         """Return the multiple of the velocity v that brings the pairs nearest to each other, ``(B,)``."""
         moved = sample(v, self.points, grid)
-        moved = moved - _of_other_map(moved) if self.slopes is None else matrix_times(self.slopes, moved)
+        moved = moved - of_other_map(moved) if self.slopes is None else matrix_times(self.slopes, moved)
         work, square = ((x * moved).flatten(1).sum(1) for x in (self.residuals, moved))
         if self.slopes is None:  # the maps of a pair go the same way
-            work, square = work + _of_other_map(work), square + _of_other_map(square)
+            work, square = work + of_other_map(work), square + of_other_map(square)
         return work / square.clamp(min=torch.finfo(v.dtype).tiny)
 
 
@@ -95,14 +95,13 @@ class MidspaceLandmarks(Landmarks):
         for _ in range(self.steps):
             defect = self.ends - _mapped(u, self.points, self.grid)
             leap = matrix_times(inverse_matrix(jacobian_at(u, self.points, self.grid)), defect)
-            voxels = (leap / leap.new_tensor(self.grid.spacing).view(1, -1, 1)).norm(dim=1, keepdim=True)
-            self.points = self.points + leap * (_LEAP / voxels.clamp(min=_LEAP))
+            self.points = self.points + leap * (_LEAP / voxels(leap, self.grid).clamp(min=_LEAP))
         self.steps = _AGAIN
-        residuals = self.points - _of_other_map(self.points)  # φ ∘ flow(v) takes to p what was at v from there
+        residuals = self.points - of_other_map(self.points)  # φ ∘ flow(v) takes to p what was at v from there
         return LandmarkForce(_mean_square(residuals), self.points, residuals)
 
 
-def _of_other_map(values: Tensor) -> Tensor:
+def of_other_map(values: Tensor) -> Tensor:
     """Return for each map of a pair what belongs to the other, half a batch away."""
     return values.roll(len(values) // 2, 0)
 
@@ -118,15 +117,15 @@ def scatter_points(values: Tensor, points: Tensor, grid: Grid) -> Tensor:
     Returns:
         ``(B, C, *S)``. The order of summation is fixed, so the result is, too.
     """
-    last = points.new_tensor([n - 1 for n in grid.shape]).view(1, -1, 1)
-    place = (points / points.new_tensor(grid.spacing).view(1, -1, 1)).clamp(min=0).minimum(last)
+    last = grid.along([n - 1 for n in grid.shape], points)
+    place = (points / grid.along(grid.spacing, points)).clamp(min=0).minimum(last)
     first = place.floor().minimum(last - 1)
     share, first = place - first, first.long()
-    strides = torch.tensor([math.prod(grid.shape[k + 1 :]) for k in range(grid.dim)], device=points.device)
+    strides = grid.along(grid.strides, first)
     nodes, parts = [], []
     for corner in product((0, 1), repeat=grid.dim):
-        ends = torch.tensor(corner, device=points.device).view(1, -1, 1)
-        nodes.append(((first + ends) * strides.view(1, -1, 1)).sum(1))
+        ends = grid.along(corner, first)
+        nodes.append(((first + ends) * strides).sum(1))
         parts.append(values * torch.where(ends > 0, share, 1 - share).prod(1, keepdim=True))
     return _summed(torch.cat(parts, dim=2), torch.cat(nodes, dim=1), grid)
 
