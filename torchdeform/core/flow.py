@@ -177,7 +177,8 @@ def integrate_points(
 
 def require_times(times: Sequence[float], where: str) -> None:
     """Raise `InputError`, which names ``where``, unless the times are two or more, increasing or decreasing."""
-    if len(times) < 2 or list(times) not in (sorted(set(times)), sorted(set(times), reverse=True)):
+    steps = [b - a for a, b in pairwise(times)]
+    if not steps or not (all(step > 0 for step in steps) or all(step < 0 for step in steps)):
         raise InputError(f"{where}: times must be two or more, increasing or decreasing, got {list(times)}")
 
 

@@ -35,6 +35,13 @@ def corresponding_channels(fixed: Image, moving: Image) -> tuple[Image, Image]:
     return luminance(both[0]), luminance(both[1])
 
 
+def require_finite(fixed: Tensor, moving: Tensor, where: str) -> None:
+    """Raise `InputError`, which names ``where``, unless all values of two images are finite."""
+    for name, image in (("fixed", fixed), ("moving", moving)):
+        if not bool(image.isfinite().all()):
+            raise InputError(f"{where}: {name} has values that are NaN or infinite; replace or mask them first")
+
+
 def fill(image: Tensor, mask: Tensor) -> Tensor:
     """Return the image with new values where the mask is 0: means of known ones, taken from ever larger cells.
 

@@ -255,8 +255,7 @@ def label_monitor(labels: Tensor, factors: Mapping[int, float], grid: Grid, smoo
     """
     values = labels if labels.dtype == torch.float64 else labels.to(torch.float32)
     grid.check_scalar(values, "label_monitor: labels")
-    if not factors or not all(math.isfinite(factor) and factor > 0 for factor in factors.values()):
-        raise InputError(f"label_monitor: factors must be positive and finite, one or more, got {dict(factors)}")
+    require_factors(factors, "label_monitor")
     taken = f = torch.zeros_like(values)
     for label, factor in factors.items():
         region = smooth((labels == label).to(values.dtype), grid, smoothing)
@@ -270,6 +269,12 @@ def label_monitor(labels: Tensor, factors: Mapping[int, float], grid: Grid, smoo
             "label_monitor: the factors leave the rest of the domain no volume; name fewer labels or lower the factors"
         )
     return f + rest * (1 - taken)
+
+
+def require_factors(factors: Mapping[int, float], where: str) -> None:
+    """Raise `InputError`, which names ``where``, unless there are factors, all positive and finite."""
+    if not factors or not all(0 < factor < math.inf for factor in factors.values()):
+        raise InputError(f"{where}: factors must be positive and finite, one or more, got {dict(factors)}")
 
 
 def smooth(field: Tensor, grid: Grid, sigma: float) -> Tensor:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -127,8 +128,7 @@ def from_jacobian_and_curl(
     return descent.solution(value)
 
 
-@dataclass(frozen=True)
-class _State:
+class _State(NamedTuple):
     """A map and how far it is off, one entry per item: u, ∇φ, data − rows, and the norm of that."""
 
     u: Tensor
@@ -137,12 +137,11 @@ class _State:
     norm: Tensor
 
     def take(self, index: Tensor) -> "_State":
-        return _State(self.u[index], self.matrix[index], self.left[index], self.norm[index])
+        return _State(*(part[index] for part in self))
 
     def choose(self, index: Tensor, other: "_State") -> "_State":
         """Return the state with the items ``index`` replaced."""
-        pairs = ((self.u, other.u), (self.matrix, other.matrix), (self.left, other.left), (self.norm, other.norm))
-        return _State(*(mine.index_copy(0, index, new) for mine, new in pairs))
+        return _State(*(mine.index_copy(0, index, new) for mine, new in zip(self, other, strict=True)))
 
 
 @dataclass(frozen=True)

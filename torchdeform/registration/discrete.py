@@ -10,6 +10,7 @@ from torch import Tensor
 from torchdeform.core.flow import OdeSolver, flow
 from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid
+from torchdeform.core.intensities import require_finite
 from torchdeform.core.resampling import MIN_NODES, hat_average, prolong, pyramid_grids, restrict
 from torchdeform.core.warp import compose, warp
 from torchdeform.errors import InputError
@@ -83,9 +84,7 @@ def _check(fixed: Tensor, moving: Tensor, mask: Tensor | None, grid: Grid) -> No
         raise InputError("discrete_start: fixed and moving must agree in batch size, dtype and device")
     if min(grid.shape) < MIN_NODES:
         raise InputError(f"discrete_start: every axis must have at least {MIN_NODES} voxels, got {grid.shape}")
-    for name, image in (("fixed", fixed), ("moving", moving)):
-        if not bool(image.isfinite().all()):
-            raise InputError(f"discrete_start: {name} has values that are NaN or infinite; replace them first")
+    require_finite(fixed, moving, "discrete_start")
     if mask is not None and (tuple(mask.shape[1:]) != (1, *grid.shape) or len(mask) not in (1, len(fixed))):
         raise InputError(
             f"discrete_start: mask must have shape {(len(fixed), 1, *grid.shape)}, got {tuple(mask.shape)}"
