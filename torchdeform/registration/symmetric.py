@@ -105,10 +105,8 @@ def symmetric_objective(problem: RegistrationProblem, grid: Grid, settings: Regi
         ones = torch.ones_like(problem.fixed[:, :1])
         masks = torch.cat([ones if mask is None else mask for mask in (problem.fixed_mask, problem.moving_mask)])
     term = SimilarityTerm(problem.grid, images, _MutualSimilarity(settings.similarity, problem.grid), masks)
-    landmarks = None
-    if settings.points_weight > 0 and problem.fixed_points is not None and problem.moving_points is not None:
-        landmarks = MidspaceLandmarks(problem.fixed_points, problem.moving_points, grid)
-    return Objective(term, landmarks, _Opposed())
+    pairs = problem.pairs if settings.points_weight > 0 else None
+    return Objective(term, pairs and MidspaceLandmarks(*pairs, grid), _Opposed())
 
 
 class _Opposed(Coupling):
