@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import compose, keep_inside, warp
-from torchdeform.errors import WHOLE, ComputationError, InputError, require_choice, require_ranges
+from torchdeform.errors import ComputationError, InputError, require_choice, require_ranges
 
 # What moves the state: (time, state) -> its rate of change; time is a scalar tensor, or a number while tracing.
 Rate = Callable[[Any, Tensor], Tensor]
@@ -74,7 +74,7 @@ class OdeSolver:
     def __post_init__(self) -> None:
         require_choice(self.method, METHODS, "integrate: method")
         voxels = (lambda x: 0 < x < math.inf, "be a positive number of voxels")
-        require_ranges(self, "integrate: ", steps=WHOLE, atol=voxels)
+        require_ranges(self, "integrate: ", steps="whole", atol=voxels)
         if self.adjoint and self.method == "squaring":
             raise InputError("integrate: squaring has no adjoint equation; take method='rk4'")
 

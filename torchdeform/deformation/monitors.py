@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchdeform.core.derivatives import divergence, jacobian
 from torchdeform.core.grid import Grid
-from torchdeform.errors import NOT_NEGATIVE, InputError, require_choice, require_ranges
+from torchdeform.errors import InputError, require_choice, require_ranges
 from torchdeform.solvers.sine_cosine import inverse_transform, transform
 
 Mean = Literal["mean", "reciprocal_mean"]
@@ -51,7 +51,7 @@ class MonitorSettings:
             raise InputError(
                 f"MonitorSettings: need 0 < f_min <= f_max, both finite, got f_min={self.f_min}, f_max={self.f_max}"
             )
-        require_ranges(self, "MonitorSettings: ", smoothing=NOT_NEGATIVE)
+        require_ranges(self, "MonitorSettings: ", smoothing="finite, not negative")
 
     def blend(self, closeness: Tensor) -> Tensor:
         """Return f_max − (f_max − f_min) · closeness, closeness being 1 where cells shall be smallest and 0 far off."""

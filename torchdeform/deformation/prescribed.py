@@ -14,7 +14,7 @@ from torchdeform.core.fold_free import largest_share
 from torchdeform.core.grid import Grid, common_batch, per_item
 from torchdeform.deformation.finite_differences import Differences
 from torchdeform.deformation.monitors import require_positive
-from torchdeform.errors import AT_LEAST_0, AT_LEAST_1, InputError, require_choice, require_ranges
+from torchdeform.errors import InputError, require_choice, require_ranges
 from torchdeform.fem.boundary import fixed_unknowns
 from torchdeform.fem.div_curl import solve_div_curl
 from torchdeform.solvers.base import Solution, Status
@@ -53,7 +53,9 @@ class NewtonSettings:
     linear_steps: int = 500
 
     def __post_init__(self) -> None:
-        require_ranges(self, "NewtonSettings: ", rtol=AT_LEAST_0, max_steps=AT_LEAST_0, linear_steps=AT_LEAST_1)
+        require_ranges(
+            self, "NewtonSettings: ", rtol="not negative", max_steps="not negative", linear_steps="at least 1"
+        )
 
 
 @dataclass(frozen=True)

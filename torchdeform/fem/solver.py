@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from torchdeform.errors import AT_LEAST_0, require_choice, require_ranges
+from torchdeform.errors import require_choice, require_ranges
 from torchdeform.fem.fast_transform import FastTransform, is_exact_for
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.solvers.base import LinearSolver
@@ -43,7 +43,7 @@ class SolverSettings:
     def __post_init__(self) -> None:
         require_choice(self.method, METHODS, "solver")
         require_choice(self.preconditioner, PRECONDITIONERS, "solver.preconditioner")
-        require_ranges(self, "solver.", rtol=AT_LEAST_0, atol=AT_LEAST_0, max_steps=AT_LEAST_0)
+        require_ranges(self, "solver.", rtol="not negative", atol="not negative", max_steps="not negative")
 
 
 def solver_of(settings: SolverSettings | str, system: DivCurlSystem) -> LinearSolver:

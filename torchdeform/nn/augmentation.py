@@ -11,7 +11,7 @@ from torchdeform.core.derivatives import CURL_PAIRS
 from torchdeform.core.grid import Grid, per_item
 from torchdeform.core.resampling import prolong
 from torchdeform.core.warp import invert
-from torchdeform.errors import NOT_NEGATIVE, SHARE, InputError, require_ranges
+from torchdeform.errors import InputError, require_ranges
 from torchdeform.nn.heads import flow_to_monitor, scale_to_bounds, with_mean_one
 from torchdeform.nn.precision import full_precision
 from torchdeform.nn.spatial import SpatialTransformer
@@ -84,7 +84,7 @@ class RandomDeformation(nn.Module):
         self.grid, self.determinant, self.curl = grid, (float(determinant[0]), float(determinant[1])), float(curl)
         self.nodes, self.probability = nodes, probability
         several = (lambda n: n >= 2, "be at least 2")
-        require_ranges(self, "RandomDeformation: ", curl=NOT_NEGATIVE, nodes=several, probability=SHARE)
+        require_ranges(self, "RandomDeformation: ", curl="finite, not negative", nodes=several, probability="0 to 1")
         self.carry = SpatialTransformer(grid, outside=outside)
 
     @torch.no_grad()

@@ -11,7 +11,7 @@ from torchdeform.core.flow import OdeSolver, integrate_rate
 from torchdeform.core.grid import Grid, per_item
 from torchdeform.core.resampling import prolong
 from torchdeform.core.warp import warp
-from torchdeform.errors import AT_LEAST_1, BETWEEN_0_AND_1, POSITIVE, InputError, require_ranges
+from torchdeform.errors import InputError, require_ranges
 from torchdeform.nn.operators import div_curl_velocity, share_within_bounds
 from torchdeform.nn.precision import full_precision
 
@@ -62,7 +62,7 @@ class JacobianCurlHead(nn.Module):
         super().__init__()
         self.grid, self.ratio, self.curl, self.steps, self.least = grid, ratio, curl, steps, least
         above_1 = (lambda x: 1 < x < math.inf, "be finite and above 1")
-        ranges = {"ratio": above_1, "curl": POSITIVE, "steps": AT_LEAST_1, "least": BETWEEN_0_AND_1}
+        ranges = {"ratio": above_1, "curl": "positive", "steps": "at least 1", "least": "inside 0 to 1"}
         require_ranges(self, "JacobianCurlHead: ", **ranges)
         self.conv = _CONV[grid.dim](channels, 1 + len(CURL_PAIRS[grid.dim]), 3, padding=1)
         nn.init.normal_(self.conv.weight, std=_FIRST_WEIGHTS)

@@ -4,19 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from torchdeform.core.flow import OdeSolver
-from torchdeform.errors import (
-    AT_LEAST_0,
-    AT_LEAST_1,
-    BELOW_1,
-    BETWEEN_0_AND_1,
-    NOT_NEGATIVE,
-    POSITIVE,
-    SHARE,
-    WINDOW,
-    InputError,
-    require_choice,
-    require_ranges,
-)
+from torchdeform.errors import RANGES, InputError, require_choice, require_ranges
 from torchdeform.fem.solver import SolverSettings
 from torchdeform.metrics.similarity import similarity_weights
 from torchdeform.registration.affine.settings import AlignmentSettings
@@ -48,7 +36,7 @@ class SimilaritySettings:
         similarity_weights(self.measure)
         if not isinstance(self.measure, str):  # a copy of our own, and a dict, which `asdict` can take
             object.__setattr__(self, "measure", dict(self.measure))
-        require_ranges(self, "similarity.", window=WINDOW)
+        require_ranges(self, "similarity.", window="window")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,9 +65,9 @@ class MetricSettings:
 
     def __post_init__(self) -> None:
         require_choice(self.order, (1, 2), "metric.order")
-        lengths = (POSITIVE[0], f"{POSITIVE[1]}, one number or one for each level")
+        lengths = (RANGES["positive"][0], f"{RANGES['positive'][1]}, one number or one for each level")
         require_ranges(
-            self, "metric.", length_scale=lengths, weight_div=POSITIVE, weight_curl=POSITIVE, elasticity=SHARE
+            self, "metric.", length_scale=lengths, weight_div="positive", weight_curl="positive", elasticity="0 to 1"
         )
 
     @property
@@ -119,10 +107,10 @@ class OptimiserSettings:
         require_ranges(
             self,
             "optimiser.",
-            steps=(AT_LEAST_0[0], "hold one number per level, none negative"),
-            step_length=POSITIVE,
-            momentum=BELOW_1,
-            tolerance=NOT_NEGATIVE,
+            steps=(RANGES["not negative"][0], "hold one number per level, none negative"),
+            step_length="positive",
+            momentum="below 1",
+            tolerance="finite, not negative",
             map_spacing=(lambda spacing: 1 <= spacing <= 8, "lie between 1 and 8 voxels"),
         )
 
@@ -144,7 +132,7 @@ class FoldSettings:
     min_determinant: float = 0.03
 
     def __post_init__(self) -> None:
-        require_ranges(self, "folds.", soft_determinant=NOT_NEGATIVE, min_determinant=BETWEEN_0_AND_1)
+        require_ranges(self, "folds.", soft_determinant="finite, not negative", min_determinant="inside 0 to 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,9 +173,9 @@ class DiscreteSettings:
             raise InputError(f"discrete.levels must not be negative and run from coarse to fine, got {self.levels}")
         if not self.coupling:
             raise InputError("discrete.coupling must have at least one price")
-        positive = dict.fromkeys(("reach", "coupling", "smoothing", "length_scale", "min_determinant"), POSITIVE)
-        require_ranges(self, "discrete.", spacing=AT_LEAST_1, **positive)
-        require_ranges(self, "discrete.", min_determinant=BELOW_1)
+        positive = dict.fromkeys(("reach", "coupling", "smoothing", "length_scale", "min_determinant"), "positive")
+        require_ranges(self, "discrete.", spacing="at least 1", **positive)
+        require_ranges(self, "discrete.", min_determinant="below 1")
 
 
 _ALIGN, _DISCRETE = AlignmentSettings(), DiscreteSettings()
@@ -247,4 +235,4 @@ class RegistrationSettings:
                 object.__setattr__(self, name, replace(_SHORT_DEFAULTS[name], **{key: value}))
         require_choice(self.start, STARTS, "start")
         require_choice(self.stencil, STENCILS, "stencil")
-        require_ranges(self, "", points_weight=NOT_NEGATIVE)
+        require_ranges(self, "", points_weight="finite, not negative")

@@ -15,7 +15,7 @@ from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Transform, place_of
 from torchdeform.core.warp import compose, invert, max_voxels
 from torchdeform.deformation.averages import average_maps
-from torchdeform.errors import AT_LEAST_0, AT_LEAST_1, ComputationError, InputError, require_choice, require_ranges
+from torchdeform.errors import RANGES, ComputationError, InputError, require_choice, require_ranges
 from torchdeform.registration.deformable import register
 from torchdeform.registration.result import Callback
 from torchdeform.registration.settings import RegistrationSettings
@@ -72,8 +72,8 @@ class AveragingSettings:
 
     def __post_init__(self) -> None:
         require_choice(self.pose, get_args(Pose), "pose")
-        voxels = (AT_LEAST_0[0], "be a number of voxels, not negative")
-        require_ranges(self, "", corrections=AT_LEAST_1, tolerance=voxels)
+        voxels = (RANGES["not negative"][0], "be a number of voxels, not negative")
+        require_ranges(self, "", corrections="at least 1", tolerance=voxels)
 
 
 _DEFAULT = AveragingSettings()

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from torchdeform.errors import AT_LEAST_1, WINDOW, require_choice, require_ranges
+from torchdeform.errors import require_choice, require_ranges
 from torchdeform.metrics.similarity import similarity_weights
 
 ALIGNMENTS = ("none", "translation", "rigid", "similarity", "affine")
@@ -53,7 +53,7 @@ class AlignmentSettings:
             object.__setattr__(self, "similarity", dict(self.similarity))
         enough = (lambda nodes: nodes >= COARSEST_NODES, f"be at least {COARSEST_NODES}")
         share = (lambda overlap: 0 < overlap <= 1, "be above 0, and 1 at most")
-        require_ranges(self, "align.", window=WINDOW, min_overlap=share, nodes=enough, steps=AT_LEAST_1)
+        require_ranges(self, "align.", window="window", min_overlap=share, nodes=enough, steps="at least 1")
 
     def window_in(self, dim: int) -> int:
         """Return the width of the window for images of ``dim`` axes."""
