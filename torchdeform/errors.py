@@ -1,7 +1,9 @@
 """Typed errors: one sentence that says what is wrong, where, and what to do about it."""
 
 import difflib
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
 
 # Set in the environment: the shell shows the traceback of an error.
 TRACEBACK = "TORCHDEFORM_TRACEBACK"
@@ -31,6 +33,37 @@ def require_choice(value: object, choices: Iterable[object], where: str) -> None
     if value not in known:
         names = [str(choice) for choice in known]
         raise InputError(f"{where} must be one of {', '.join(names)}, got {value!r}{nearest_name(str(value), names)}")
+
+
+# What a number must be: the test, and the words for it; those that are asked for often have a name.
+Range = tuple[Callable[[Any], bool], str]
+RANGES: dict[str, Range] = {
+    "positive": (lambda x: 0 < x < math.inf, "be positive and finite"),
+    "finite, not negative": (lambda x: 0 <= x < math.inf, "be finite and not negative"),
+    "not negative": (lambda x: x >= 0, "not be negative"),
+    "at least 1": (lambda x: 1 <= x < math.inf, "be at least 1"),
+    "whole": (lambda x: isinstance(x, int) and x >= 1, "be a whole number, at least 1"),
+    "below 1": (lambda x: 0 <= x < 1, "be at least 0 and below 1"),
+    "inside 0 to 1": (lambda x: 0 < x < 1, "lie between 0 and 1"),
+    "0 to 1": (lambda x: 0 <= x <= 1, "lie between 0 and 1, both allowed"),
+    "window": (lambda x: x >= 3 and x % 2 == 1, "be an odd number of voxels, at least 3"),
+}
+
+
+def require_ranges(settings: object, prefix: str, **ranges: str | Range) -> None:
+    """Raise `InputError` unless the numbers of these names are in range.
+
+    Args:
+        settings: has them as attributes: a number, None, which is always allowed, or one or more of them.
+        prefix: what comes before the name in the message, say ``"optimiser."``.
+        ranges: what each must be, a name of `RANGES` or a range of its own.
+    """
+    for name, wanted in ranges.items():
+        fits, words = RANGES[wanted] if isinstance(wanted, str) else wanted
+        value = getattr(settings, name)
+        numbers = value if isinstance(value, tuple | list) else (value,)
+        if not numbers or not all(number is None or fits(number) for number in numbers):
+            raise InputError(f"{prefix}{name} must {words}, got {value!r}")
 
 
 def explain(error: Exception) -> tuple[str, int]:

@@ -6,10 +6,10 @@ import torch
 from torchdeform.core.grid import Grid
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.fem.fast_transform import FastTransform, TransformFactor
-from torchdeform.fem.solver import SolverSettings, solver_of
+from torchdeform.fem.solver import PRECONDITIONERS, SolverSettings, solver_of
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
-from torchdeform.solvers.cg import ConjugateGradient, Jacobi
+from torchdeform.solvers.cg import ConjugateGradient, jacobi
 
 GRIDS = [Grid((9, 12), (0.5, 1.3)), Grid((5, 6, 7), (0.7, 1.0, 1.4))]
 SYSTEMS = [DivCurlSystem(grid, Weights(0.5, 1.0, 0.02)) for grid in GRIDS]
@@ -57,7 +57,9 @@ def test_auto_takes_the_direct_solver_where_it_is_exact():
     assert isinstance(solver_of("auto", exact), FastTransform)
     assert isinstance(solver_of("auto", exact).init(exact, load_of(exact)), TransformFactor)
     for system in (varying, held):
-        assert solver_of("auto", system) == ConjugateGradient(preconditioner=FastTransform(approximate=True))
+        chosen = solver_of("auto", system)
+        assert chosen == ConjugateGradient(preconditioner=PRECONDITIONERS["transform"])
+        assert chosen.preconditioner.__self__ == FastTransform(approximate=True)
         with pytest.raises(InputError, match="transform is not exact"):
             solver_of("transform", system).init(system, load_of(exact))
 
@@ -87,6 +89,13 @@ def test_gradients_of_weights_go_through_the_matrix_free_operator():
     torch.testing.assert_close(found["cg"], found["assembled"], rtol=1e-8, atol=1e-8)
 
 
+def test_jacobi_divides_by_the_diagonal():
+    load = load_of(SYSTEMS[1])
+    diagonal = SYSTEMS[1].matrix().to_dense().diagonal().view(load[0].shape)
+    divided = (SYSTEMS[1].free(x) for x in (jacobi(SYSTEMS[1], load)(load), load / diagonal))
+    torch.testing.assert_close(*divided, rtol=1e-12, atol=0.0)
+
+
 def test_what_cannot_be_solved_is_an_error():
     system = SYSTEMS[0]
     load = load_of(system, batch=1)
@@ -95,8 +104,8 @@ def test_what_cannot_be_solved_is_an_error():
         solver_of(few, system).init(system, load)(load)
     with pytest.raises(InputError, match="did you mean 'assembled'"):
         solver_of("asembled", system)
-    with pytest.raises(InputError, match="preconditioner"):
-        Jacobi().init(system, load).solution(load)
+    with pytest.raises(InputError, match=r"preconditioner must be one of .* did you mean 'jacobi'"):
+        SolverSettings(preconditioner="jacoby")
     batch = DivCurlSystem(GRIDS[0], Weights(torch.rand(2, 1, 8, 11) + 1))
     with pytest.raises(InputError, match="got a batch of 2"):
         solver_of("assembled", batch).init(batch, load)

@@ -4,12 +4,13 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import groupby, product
+from operator import itemgetter
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchdeform.core.derivatives import CURL_PAIRS, by_slabs, jacobian_determinant
+from torchdeform.core.derivatives import CURL_PAIRS, LEAST_ROWS, by_slabs, jacobian_determinant
 from torchdeform.core.grid import Grid, slabs
 from torchdeform.core.warp import compose, voxels
 
@@ -24,9 +25,6 @@ _FRAMES = {
         (((1, 1, 0), (0, 1, 1), (1, 0, 1)), ((0, 0, 0), (1, 1, 1)), 2.0),
     ),
 }
-
-# A slab has some rows at least, because its two outer rows are computed twice.
-_SLAB_ROWS = 4
 
 # Determinants are raised to this before their logarithm is taken.
 LOG_FLOOR = 1e-9
@@ -105,19 +103,6 @@ def _central_determinant(u: Tensor, grid: Grid) -> Tensor:
     return det
 
 
-def is_diffeomorphic(u: Tensor, grid: Grid) -> Tensor:
-    """Return for each item ``(B,)`` whether all one-sided determinants of φ = id + u are positive.
-
-    Args:
-        u: displacement ``(B, D, *S)`` in units of spacing.
-        grid: its grid.
-
-    Raises:
-        InputError: shape.
-    """
-    return smallest_determinant(u, grid) > 0
-
-
 def smallest_determinant(u: Tensor, grid: Grid) -> Tensor:
     """Return the smallest of all one-sided determinants of φ = id + u over the nodes.
 
@@ -189,7 +174,7 @@ def _lowest_by_slab(u: Tensor, grid: Grid) -> Iterator[Tensor]:
     temporaries take longer than the arithmetic.
     """
     buffers = _Buffers(u)
-    for rows in slabs((grid.shape[0], u[:, 0, 0].numel()), u.device, least=_SLAB_ROWS):
+    for rows in slabs((grid.shape[0], u[:, 0, 0].numel()), u.device, least=LEAST_ROWS):
         yield _lowest(_padded_slab(u, grid, rows.start, rows.stop, buffers), buffers)
 
 
@@ -244,14 +229,11 @@ def _determinants(
     """Yield det[moved steps] = x · n for each frame; n, the normal of all steps but the first, is shared by frames."""
     dim, shape = len(moved), moved[0][0][0].shape
     normal, det = buffers.get("normal", dim, *shape).unbind(0), buffers.get("det", *shape)
-    for ends, group in groupby(sorted(frames, key=_ends_of_others), key=_ends_of_others):
+    ends_of_others = itemgetter(slice(1, None))
+    for ends, group in groupby(sorted(frames, key=ends_of_others), key=ends_of_others):
         _NORMAL[dim](*(ways[end] for ways, end in zip(moved[1:], ends, strict=True)), out=normal)
         for first, *_ in group:
             yield _dot(moved[0][first], normal, out=det)
-
-
-def _ends_of_others(frame: tuple[int, ...]) -> tuple[int, ...]:
-    return frame[1:]
 
 
 def _dot(a: _Vector, b: _Vector, *, out: Tensor) -> Tensor:

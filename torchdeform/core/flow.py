@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import compose, keep_inside, warp
-from torchdeform.errors import ComputationError, InputError, require_choice
+from torchdeform.errors import ComputationError, InputError, require_choice, require_ranges
 
 # What moves the state: (time, state) -> its rate of change; time is a scalar tensor, or a number while tracing.
 Rate = Callable[[Any, Tensor], Tensor]
@@ -73,10 +73,8 @@ class OdeSolver:
 
     def __post_init__(self) -> None:
         require_choice(self.method, METHODS, "integrate: method")
-        if not isinstance(self.steps, int) or self.steps < 1:
-            raise InputError(f"integrate: steps must be a whole number, at least 1, got {self.steps!r}")
-        if not (math.isfinite(self.atol) and self.atol > 0):
-            raise InputError(f"integrate: atol must be a positive number of voxels, got {self.atol!r}")
+        voxels = (lambda x: 0 < x < math.inf, "be a positive number of voxels")
+        require_ranges(self, "integrate: ", steps="whole", atol=voxels)
         if self.adjoint and self.method == "squaring":
             raise InputError("integrate: squaring has no adjoint equation; take method='rk4'")
 
@@ -172,12 +170,16 @@ def integrate_points(
     """
     if points.dim() < 3 or points.shape[1] != grid.dim:
         raise InputError(f"integrate_points: points must have shape (B, {grid.dim}, *T), got {tuple(points.shape)}")
+    require_times(times, "integrate_points")
+    trajectory = integrate_rate(rate, points, times, grid, solver or OdeSolver(), parameters)
+    return trajectory.clamp(min=0.0).clamp(max=grid.along(grid.extent, points))
+
+
+def require_times(times: Sequence[float], where: str) -> None:
+    """Raise `InputError`, which names ``where``, unless the times are two or more, increasing or decreasing."""
     steps = [b - a for a, b in pairwise(times)]
     if not steps or not (all(step > 0 for step in steps) or all(step < 0 for step in steps)):
-        raise InputError(f"integrate_points: times must be two or more, increasing or decreasing, got {list(times)}")
-    trajectory = integrate_rate(rate, points, times, grid, solver or OdeSolver(), parameters)
-    farthest = grid.along(grid.extent, points).view(-1, *([1] * (points.dim() - 2)))
-    return trajectory.clamp(min=0.0).clamp(max=farthest)
+        raise InputError(f"{where}: times must be two or more, increasing or decreasing, got {list(times)}")
 
 
 def integrate_rate(
@@ -286,7 +288,7 @@ def _equal_steps(steps: int) -> Callable[[Rate, Tensor, Tensor], Tensor]:
 
 def _adaptive(start: Tensor, times: Sequence[float], grid: Grid, solver: OdeSolver) -> dict[str, Any]:
     """Return the settings of an adaptive method: the error of a step is its largest component, in voxels."""
-    spacing = grid.along(grid.spacing, start).view(-1, *([1] * (start.dim() - 2)))
+    spacing = grid.along(grid.spacing, start)
 
     def norm(x: Tensor) -> Tensor:
         return (x / spacing).abs().amax()

@@ -7,20 +7,18 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.core.derivatives import jacobian_determinant
 from torchdeform.core.diagnostics import one_sided_determinant
 from torchdeform.core.grid import Grid, per_item
+from torchdeform.core.resampling import MAX_POOL
 from torchdeform.errors import ComputationError
 
 Trial = TypeVar("Trial")
 
 # Rounds of smoothing: so many for the floor that is asked for, and for no folds at all. 50 is the most that was seen.
 _FLOOR_ROUNDS, _ROUNDS = 100, 1000
-
-_WIDEN = {2: F.max_pool2d, 3: F.max_pool3d}
 
 
 def largest_share(accept: Callable[[Tensor], Tensor], like: Tensor, *, halvings: int, refine: bool = False) -> Tensor:
@@ -98,7 +96,7 @@ def repair_folds(u: Tensor, grid: Grid, floor: float = 0.0) -> Tensor:
             return u
         if step == 0 and not bool(u.isfinite().all()):
             raise ComputationError("the map is not finite; check the images for extreme values, or take smaller steps")
-        wider = _WIDEN[grid.dim](folded.to(u.dtype), 3, stride=1, padding=1)
+        wider = MAX_POOL[grid.dim](folded.to(u.dtype), 3, stride=1, padding=1)
         share = torch.maximum(share, wider)
         fading = neighbour_mean(share)
         u = keep_faces(torch.lerp(u, neighbour_mean(u), fading.expand_as(u)), u, grid)

@@ -1,7 +1,7 @@
 """Geometry of a regular grid: shape, spacing, and the positions of its nodes."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, product
@@ -76,8 +76,24 @@ class Grid:
         return math.prod(self.spacing)
 
     def along(self, values: Sequence[float], like: Tensor) -> Tensor:
-        """Return D numbers as a ``(1, D, 1, ..)`` tensor that broadcasts over a vector field like ``like``."""
-        return torch.as_tensor(values, dtype=like.dtype, device=like.device).view(1, self.dim, *([1] * self.dim))
+        """Return D numbers as a ``(1, D, 1, ..)`` tensor that broadcasts over vectors ``(B, D, *T)`` like ``like``.
+
+        Where that has fewer axes, it gives type and device only, and T is the shape of the grid.
+        """
+        ones = [1] * (like.dim() - 2 if like.dim() > 2 else self.dim)
+        return torch.as_tensor(values, dtype=like.dtype, device=like.device).view(1, -1, *ones)
+
+    @property
+    def strides(self) -> tuple[int, ...]:
+        """By how much the number of a node grows from one to the next along each axis, the last running fastest."""
+        return tuple(math.prod(self.shape[k + 1 :]) for k in range(self.dim))
+
+    def with_shape(self, shape: Iterable[int]) -> "Grid":
+        """Return the grid of the same box with so many nodes along each axis."""
+        shape = tuple(shape)
+        if shape == self.shape:
+            return self
+        return Grid(shape, tuple(side / (n - 1) for side, n in zip(self.extent, shape, strict=True)))
 
     def points(
         self,
@@ -176,6 +192,14 @@ def limit_threads(fields: int, grid: Grid) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def common_batch(where: str, *tensors: Tensor) -> int:
+    """Return the batch size of tensors; raise `InputError`, which names ``where``, unless they agree or are 1."""
+    sizes = {tensor.shape[0] for tensor in tensors if tensor.dim() > 0} - {1} or {1}
+    if len(sizes) > 1:
+        raise InputError(f"{where}: batch sizes must agree or be 1, got {sorted(sizes)}")
+    return sizes.pop()
 
 
 def per_item(per_item: Tensor, like: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid, over_slabs
-from torchdeform.core.warp import sample
+from torchdeform.core.warp import inside_box, sample
 from torchdeform.errors import InputError
 
 # Alpha that means opaque, by pixel type; floating types count from 0 to 1.
@@ -187,6 +187,13 @@ def require_same_place(image: Image, other: Image, *, atol: float = 1e-3) -> Non
         )
 
 
+def require_same_dimension(image: Image, other: Image) -> None:
+    """Raise `InputError` if one image is 2D and the other 3D."""
+    if image.grid.dim != other.grid.dim:
+        kinds = f"{image.name} is {image.grid.dim}D but {other.name} is {other.grid.dim}D"
+        raise InputError(f"{kinds}; give two images of the same dimension")
+
+
 def overlap(fixed: Image, moving: Image, *, samples: int = 32) -> float:
     """Return the share of the fixed grid that is inside the moving image, 0 (apart) to 1 (covered).
 
@@ -198,11 +205,7 @@ def overlap(fixed: Image, moving: Image, *, samples: int = 32) -> float:
     Raises:
         InputError: one image is 2D and the other 3D.
     """
-    if fixed.grid.dim != moving.grid.dim:
-        kinds = f"{fixed.name} is {fixed.grid.dim}D but {moving.name} is {moving.grid.dim}D"
-        raise InputError(f"{kinds}; give two images of the same dimension")
+    require_same_dimension(fixed, moving)
     sides = [torch.linspace(0, side, samples, dtype=torch.float64) for side in fixed.grid.extent]
     points = torch.stack(torch.meshgrid(*sides, indexing="ij")).unsqueeze(0)
-    index = moving.to_grid(fixed.to_world(points)) / moving.grid.along(moving.grid.spacing, points)
-    last = moving.grid.along([n - 1 for n in moving.grid.shape], points)
-    return float(((index >= -0.5) & (index <= last + 0.5)).all(dim=1).double().mean())
+    return float(inside_box(moving.to_grid(fixed.to_world(points)), moving.grid).double().mean())

@@ -7,13 +7,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.core.image import Image, luminance, opaque
-from torchdeform.core.resampling import LINEAR_MODES
+from torchdeform.core.resampling import AVERAGE_POOL, LINEAR_MODES
 from torchdeform.errors import InputError
 
 # Values of one channel that its percentiles are taken from, at most.
 _SAMPLES = 2**20
-
-_POOL = {2: F.avg_pool2d, 3: F.avg_pool3d}
 
 
 def corresponding_channels(fixed: Image, moving: Image) -> tuple[Image, Image]:
@@ -37,6 +35,13 @@ def corresponding_channels(fixed: Image, moving: Image) -> tuple[Image, Image]:
     return luminance(both[0]), luminance(both[1])
 
 
+def require_finite(fixed: Tensor, moving: Tensor, where: str) -> None:
+    """Raise `InputError`, which names ``where``, unless all values of two images are finite."""
+    for name, image in (("fixed", fixed), ("moving", moving)):
+        if not bool(image.isfinite().all()):
+            raise InputError(f"{where}: {name} has values that are NaN or infinite; replace or mask them first")
+
+
 def fill(image: Tensor, mask: Tensor) -> Tensor:
     """Return the image with new values where the mask is 0: means of known ones, taken from ever larger cells.
 
@@ -55,7 +60,7 @@ def fill(image: Tensor, mask: Tensor) -> Tensor:
 def _fill(image: Tensor, known: Tensor) -> Tensor:
     if bool(known.all()):
         return image
-    pool, weight = _POOL[image.dim() - 2], known.to(image.dtype)
+    pool, weight = AVERAGE_POOL[image.dim() - 2], known.to(image.dtype)
     cell = tuple(min(2, n) for n in image.shape[2:])
     share = pool(weight, cell, ceil_mode=True)
     mean = pool(image * weight, cell, ceil_mode=True) / share.clamp(min=torch.finfo(image.dtype).tiny)

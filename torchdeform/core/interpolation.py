@@ -4,11 +4,11 @@ import math
 from collections.abc import Callable
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.warp import sample
+from torchdeform.core.resampling import MAX_POOL
+from torchdeform.core.warp import inside_box, sample
 from torchdeform.errors import InputError, require_choice
 
 Sampler = Callable[[Tensor], Tensor]
@@ -35,8 +35,6 @@ _LABEL_KERNEL: _Kernel = (
 # Nodes whose labels count are at most this far from the nearest one; and the number of points done at once.
 _RADIUS = 2
 _POINTS_AT_ONCE = 2**16
-
-_MAX_POOL = {2: F.max_pool2d, 3: F.max_pool3d}
 
 
 def interpolator(image: Tensor, grid: Grid, *, mode: str = "linear", outside: float | None = 0.0) -> Sampler:
@@ -79,9 +77,9 @@ def _nearest(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
     def at(points: Tensor) -> Tensor:
         index = _index(points, grid)
         node = torch.zeros_like(index[0], dtype=torch.long)
-        for x, n, stride in zip(index, grid.shape, _strides(grid), strict=True):
+        for x, n, stride in zip(index, grid.shape, grid.strides, strict=True):
             node += torch.floor(x.detach() + 0.5).nan_to_num().clamp(0, n - 1).long() * stride
-        return _fill(_take(values, node), index, grid, outside)
+        return _fill(_take(values, node), points, grid, outside)
 
     return at
 
@@ -100,7 +98,7 @@ def _label(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
             for some in zip(*(part.split(_POINTS_AT_ONCE) for part in there), strict=True):
                 near = [x[some].clamp(0, n - 1) for x, n in zip(index, grid.shape, strict=True)]
                 found[:, channel][some] = _heaviest_label(*_weighted_labels(values, near, grid))
-        return _fill(found, index, grid, outside)
+        return _fill(found, points, grid, outside)
 
     return at
 
@@ -111,7 +109,7 @@ def _near_border(image: Tensor) -> Tensor:
     for axis in range(2, image.dim()):
         radius = [_RADIUS if a == axis else 0 for a in range(2, image.dim())]
         window = [2 * r + 1 for r in radius]
-        low, high = (_MAX_POOL[len(radius)](part, window, 1, radius).view(image.shape) for part in (low, high))
+        low, high = (MAX_POOL[len(radius)](part, window, 1, radius).view(image.shape) for part in (low, high))
     return low + high != 0
 
 
@@ -119,7 +117,7 @@ def _weighted_labels(values: Tensor, index: list[Tensor], grid: Grid) -> tuple[T
     """Return the labels of the nodes around each position, given in voxels, and their weights, ``(4^D, N)`` each."""
     nodes = torch.zeros_like(index[0], dtype=torch.long).unsqueeze(0)
     weights = torch.ones_like(nodes, dtype=torch.float32)
-    for x, n, stride in zip(index, grid.shape, _strides(grid), strict=True):
+    for x, n, stride in zip(index, grid.shape, grid.strides, strict=True):
         near = _support(x, n, stride, torch.float32, _LABEL_KERNEL)
         nodes = torch.cat([nodes + node for node, _ in near])
         weights = torch.cat([weights * weight for _, weight in near])
@@ -151,10 +149,10 @@ def _cubic(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
         index = _index(points, grid)
         if outside is None:
             index = tuple(x.clamp(0, n - 1) for x, n in zip(index, grid.shape, strict=True))
-        along = zip(index, grid.shape, _strides(grid), strict=True)
+        along = zip(index, grid.shape, grid.strides, strict=True)
         supports = [_support(x, n, stride, image.dtype, _SPLINE) for x, n, stride in along]
         start = torch.zeros_like(index[0], dtype=torch.long)
-        return _fill(_weighted_sum(coefficients, supports, start), index, grid, outside)
+        return _fill(_weighted_sum(coefficients, supports, start), points, grid, outside)
 
     return at
 
@@ -200,11 +198,6 @@ def _index(points: Tensor, grid: Grid) -> tuple[Tensor, ...]:
     return tuple(points[:, k] / h for k, h in enumerate(grid.spacing))
 
 
-def _strides(grid: Grid) -> tuple[int, ...]:
-    """Return by how much the position in the flattened grid grows from node to node along each axis."""
-    return tuple(math.prod(grid.shape[k + 1 :]) for k in range(grid.dim))
-
-
 def _support(index: Tensor, count: int, stride: int, dtype: torch.dtype, kernel: _Kernel) -> _Support:
     """Return the four nodes around each position along one axis, mirrored into the grid, and their weights."""
     start = torch.floor(index.detach())
@@ -220,11 +213,6 @@ def _take(values: Tensor, nodes: Tensor) -> Tensor:
     return values.index_select(1, nodes.flatten()).view(-1, *nodes.shape).movedim(0, 1)
 
 
-def _fill(values: Tensor, index: tuple[Tensor, ...], grid: Grid, outside: float | None) -> Tensor:
+def _fill(values: Tensor, points: Tensor, grid: Grid, outside: float | None) -> Tensor:
     """Put ``outside`` where the nearest node, were the grid continued, is not of the grid."""
-    if outside is None:
-        return values
-    inside = torch.ones_like(index[0], dtype=torch.bool)
-    for x, n in zip(index, grid.shape, strict=True):
-        inside &= (x >= -0.5) & (x < n - 0.5)
-    return torch.where(inside.unsqueeze(1), values, outside)
+    return values if outside is None else torch.where(inside_box(points, grid), values, outside)

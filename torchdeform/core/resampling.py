@@ -286,8 +286,10 @@ _MIN_LONGEST = 16
 # Standard deviation of the smoothing before a level, in voxels of that level.
 _BLUR = 0.5
 
-# The word for linear interpolation in `F.interpolate`, by dimension.
+# The word for linear interpolation in `F.interpolate`, and the means and maxima over windows, by dimension.
 LINEAR_MODES = {2: "bilinear", 3: "trilinear"}
+AVERAGE_POOL = {2: F.avg_pool2d, 3: F.avg_pool3d}
+MAX_POOL = {2: F.max_pool2d, 3: F.max_pool3d}
 
 
 def pyramid_grids(grid: Grid, levels: int) -> list[Grid]:
@@ -316,13 +318,10 @@ def coarsened(grid: Grid, factor: float) -> Grid:
 
 def with_spacing(grid: Grid, spacing: float) -> Grid:
     """Return the grid of the same box with about this spacing; larger ones stay, and so do 8 nodes of an axis."""
-    shape = tuple(
+    return grid.with_shape(
         n if h >= spacing else min(n, max(MIN_NODES, round(side / spacing) + 1))
         for n, h, side in zip(grid.shape, grid.spacing, grid.extent, strict=True)
     )
-    if shape == grid.shape:
-        return grid
-    return Grid(shape, tuple(side / (n - 1) for side, n in zip(grid.extent, shape, strict=True)))
 
 
 def restrict(image: Tensor, grid: Grid, coarse: Grid) -> Tensor:

@@ -1,6 +1,5 @@
 """Sampling images and fields at moved points: warp, compose, invert. The only file that calls grid_sample."""
 
-import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Literal, overload
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from torchdeform.core.derivatives import LEAST_ROWS, cofactors, derivative, determinant, map_jacobian, slab_of
 from torchdeform.core.grid import Grid, over_slabs
-from torchdeform.core.resampling import LINEAR_MODES
+from torchdeform.core.resampling import AVERAGE_POOL, prolong
 from torchdeform.errors import InputError, require_choice
 
 _MODES = {"linear": "bilinear", "nearest": "nearest"}
@@ -65,7 +64,7 @@ def sample(image: Tensor, points: Tensor, grid: Grid, *, mode: str = "linear", o
         given = f"{tuple(points.shape)} of {points.dtype}"
         raise InputError(f"sample: points must be floating-point of shape (B, {grid.dim}, *T), got {given}")
     values = _sample(image, _normalise([-1.0] * grid.dim, points, grid), mode)
-    return values if outside is None else torch.where(_inside(points, grid), values, outside)
+    return values if outside is None else torch.where(inside_box(points, grid), values, outside)
 
 
 def warp(image: Tensor, u: Tensor, grid: Grid, *, mode: str = "linear", outside: float | None = None) -> Tensor:
@@ -92,7 +91,7 @@ def warp(image: Tensor, u: Tensor, grid: Grid, *, mode: str = "linear", outside:
     values = _pulled(image, u, grid, slice(None), mode)
     if outside is None:
         return values
-    return torch.where(_inside(grid.points(dtype=u.dtype, device=u.device) + u, grid), values, outside)
+    return torch.where(inside_box(grid.points(dtype=u.dtype, device=u.device) + u, grid), values, outside)
 
 
 def _pulled(image: Tensor, u: Tensor, grid: Grid, rows: slice, mode: str = "linear") -> Tensor:
@@ -120,7 +119,7 @@ def _normalise(start: Sequence[Tensor | float], moved: Tensor, grid: Grid) -> Te
     return box
 
 
-def _inside(points: Tensor, grid: Grid) -> Tensor:
+def inside_box(points: Tensor, grid: Grid) -> Tensor:
     """Return ``(B, 1, *T)``, True where the nearest node, were the grid continued, belongs to the grid (as in ITK)."""
     inside = torch.ones((), dtype=torch.bool, device=points.device)
     for k, (n, h) in enumerate(zip(grid.shape, grid.spacing, strict=True)):
@@ -220,25 +219,21 @@ def invert(
         w = _find_inverse(u, grid, atol, max_steps)
     if u.requires_grad:
         with torch.no_grad():
-            inverse = _inverse_jacobian(u, grid)
+            inverse = inverse_matrix(map_jacobian(u, grid))
+            inverse = warp(inverse.flatten(1, 2), w, grid).view(inverse.shape)
         moved = warp(u, w, grid)
-        w = w - _times(warp(inverse, w, grid), moved - moved.detach())  # w as it is, with δw = −∇φ⁻¹ δu(x + w)
+        w = w - matrix_times(inverse, moved - moved.detach())  # w as it is, with δw = −∇φ⁻¹ δu(x + w)
     return (w, max_voxels(compose(u, w, grid), grid)) if return_error else w
 
 
-def _inverse_jacobian(u: Tensor, grid: Grid) -> Tensor:
-    """Return (∇φ)⁻¹ at the nodes, row after row, as ``(B, D·D, *S)``; finite also where φ folds."""
-    return _inverted(map_jacobian(u, grid))
+def inverse_matrix(matrix: Tensor) -> Tensor:
+    """Return the inverse of ``(B, D, D, *T)``, finite: a small determinant counts as one a little larger."""
+    return cofactors(matrix).transpose(1, 2) / determinant(matrix).clamp(min=_SMALLEST_DETERMINANT).unsqueeze(1)
 
 
-def _inverted(matrix: Tensor) -> Tensor:
-    """Return the inverse of ``(B, D, D, *T)``, row after row, a small determinant counting as one a little larger."""
-    inverse = cofactors(matrix).transpose(1, 2) / determinant(matrix).clamp(min=_SMALLEST_DETERMINANT).unsqueeze(1)
-    return inverse.flatten(1, 2)
-
-
-def _times(rows: Tensor, vector: Tensor) -> Tensor:
-    return (rows.unflatten(1, (-1, vector.shape[1])) * vector.unsqueeze(1)).sum(dim=2)
+def matrix_times(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Return the products of ``(B, D, D, *T)`` with ``(B, D, *T)``."""
+    return (matrix * vector.unsqueeze(1)).sum(dim=2)
 
 
 def _find_inverse(u: Tensor, grid: Grid, atol: float, max_steps: int) -> Tensor:
@@ -250,15 +245,11 @@ def _find_inverse(u: Tensor, grid: Grid, atol: float, max_steps: int) -> Tensor:
     if halves == grid.shape:
         start = -u
     else:
-        coarse = Grid(halves, tuple(e / (n - 1) for e, n in zip(grid.extent, halves, strict=True)))
-        start = _resized(_find_inverse(_resized(u, coarse), coarse, max(atol, _START_ERROR), max_steps), grid)
+        coarse = grid.with_shape(halves)
+        start = prolong(_find_inverse(prolong(u, coarse), coarse, max(atol, _START_ERROR), max_steps), grid)
     w = _approach(u, keep_inside(start, grid), grid, atol)  # outside Ω, where u is continued, w may lose its way
     items = zip(u.split(1), w.split(1), strict=True)
     return torch.cat([_finished(one, found, grid, atol, max_steps) for one, found in items])
-
-
-def _resized(u: Tensor, grid: Grid) -> Tensor:
-    return F.interpolate(u, size=grid.shape, mode=LINEAR_MODES[grid.dim], align_corners=True)
 
 
 def _approach(u: Tensor, w: Tensor, grid: Grid, atol: float) -> Tensor:
@@ -316,8 +307,7 @@ def _finished(u: Tensor, w: Tensor, grid: Grid, atol: float, max_steps: int) -> 
 
 def _nodes_at(places: Tensor, grid: Grid, like: Tensor) -> Tensor:
     """Return nodes of grid_sample's box ``(1, D, N)`` by their places in the flattened grid."""
-    strides = [math.prod(grid.shape[k + 1 :]) for k in range(grid.dim)]
-    lines = zip(_lines(grid, like), strides, grid.shape, strict=True)
+    lines = zip(_lines(grid, like), grid.strides, grid.shape, strict=True)
     return torch.stack([line.flatten()[places // stride % n] for line, stride, n in lines]).unsqueeze(0)
 
 
@@ -328,7 +318,7 @@ def _newton(u: Tensor, grid: Grid, nodes: Tensor, w: Tensor, atol: float, max_st
     alone.
     """
     defect = w + _from_nodes(u, nodes, w, grid)
-    error = _lengths(defect, grid)
+    error = voxels(defect, grid)
     state = w, defect, error, torch.ones_like(error)
     for _ in range(0, max_steps, _REFRESH):
         w, _, error, fraction = state
@@ -344,11 +334,11 @@ def _newton(u: Tensor, grid: Grid, nodes: Tensor, w: Tensor, atol: float, max_st
 def _few_steps(u: Tensor, grid: Grid, nodes: Tensor, state: tuple[Tensor, ...], atol: float) -> tuple[Tensor, ...]:
     """Return w, its defect, its error and the fraction of a step to try, after steps with one ∇φ⁻¹."""
     w, defect, error, fraction = state
-    rows = _inverse_jacobian_at(u, (nodes + 1) * (_column(grid.extent, w) / 2) + w, grid)
+    inverse = inverse_matrix(jacobian_at(u, (nodes + 1) * (grid.along(grid.extent, w) / 2) + w, grid))
     for _ in range(_REFRESH):
-        trial = w - fraction * _times(rows, defect)
+        trial = w - fraction * matrix_times(inverse, defect)
         trial_defect = trial + _from_nodes(u, nodes, trial, grid)
-        trial_error = _lengths(trial_defect, grid)
+        trial_error = voxels(trial_defect, grid)
         active = error > atol
         nearer = active & (trial_error < error)
         w, defect = torch.where(nearer, trial, w), torch.where(nearer, trial_defect, defect)
@@ -357,8 +347,8 @@ def _few_steps(u: Tensor, grid: Grid, nodes: Tensor, state: tuple[Tensor, ...], 
     return w, defect, error, fraction
 
 
-def _inverse_jacobian_at(u: Tensor, points: Tensor, grid: Grid) -> Tensor:
-    """Return (∇φ)⁻¹ at points of Ω, row after row, from differences over one voxel to either side."""
+def jacobian_at(u: Tensor, points: Tensor, grid: Grid) -> Tensor:
+    """Return ∇φ ``(B, D, D, *T)`` at points ``(B, D, *T)`` of Ω from differences over one voxel to either side."""
     columns = []
     for axis, (h, length) in enumerate(zip(grid.spacing, grid.extent, strict=True)):
         ends = [points.clone(), points.clone()]
@@ -366,7 +356,7 @@ def _inverse_jacobian_at(u: Tensor, points: Tensor, grid: Grid) -> Tensor:
         ends[1][:, axis] = (points[:, axis] + h).clamp(h, length)
         moved = [end + sample(u, end, grid) for end in ends]
         columns.append((moved[1] - moved[0]) / (ends[1] - ends[0])[:, axis : axis + 1])
-    return _inverted(torch.stack(columns, dim=2))
+    return torch.stack(columns, dim=2)
 
 
 def _from_nodes(u: Tensor, nodes: Tensor, w: Tensor, grid: Grid) -> Tensor:
@@ -374,17 +364,9 @@ def _from_nodes(u: Tensor, nodes: Tensor, w: Tensor, grid: Grid) -> Tensor:
     return _sample(u, _normalise(nodes.unbind(1), w, grid), "linear")
 
 
-def _column(values: Sequence[float], like: Tensor) -> Tensor:
-    return torch.tensor(values, dtype=like.dtype, device=like.device).view(-1, 1)
-
-
-def _lengths(defect: Tensor, grid: Grid) -> Tensor:
-    return (defect / _column(grid.spacing, defect)).square_().sum(dim=1, keepdim=True).sqrt_()
-
-
 def _mean_of_neighbours(w: Tensor, known: Tensor) -> Tensor:
     """Return at each node the mean of w over the known ones among it and its neighbours, or w if there is none."""
-    pool = {2: F.avg_pool2d, 3: F.avg_pool3d}[w.shape[1]]
+    pool = AVERAGE_POOL[w.shape[1]]
     share = pool(known.to(w.dtype), 3, stride=1, padding=1)
     mean = pool(w * known, 3, stride=1, padding=1) / share.clamp(min=torch.finfo(w.dtype).tiny)
     return torch.where(share > 0, mean, w)
@@ -409,7 +391,7 @@ def keep_inside(u: Tensor, grid: Grid) -> Tensor:
 
 @torch.no_grad()
 def voxels(u: Tensor, grid: Grid) -> Tensor:
-    """Return |u(x)| in voxels, ``(B, 1, *S)``; not differentiable."""
+    """Return |u| in voxels ``(B, 1, *T)`` of vectors ``(B, D, *T)``; not differentiable."""
     squares = (u / grid.along(grid.spacing, u)).square_()
     return squares.sum(dim=1, keepdim=True).sqrt_()  # ten times faster than norm(dim=1)
 

@@ -7,7 +7,7 @@ from torchdeform.core.derivatives import determinant, jacobian, map_jacobian
 from torchdeform.core.diagnostics import smallest_determinant
 from torchdeform.core.fold_free import largest_share
 from torchdeform.core.grid import Grid, per_item
-from torchdeform.core.warp import warp
+from torchdeform.core.warp import matrix_times, warp
 from torchdeform.deformation.velocity import mode_angles, potential_velocity
 from torchdeform.fem.boundary import fixed_unknowns
 
@@ -48,7 +48,7 @@ def correct_determinant(u: Tensor, start: Tensor, end: Tensor, grid: Grid) -> Te
     gradient = map_jacobian(u, grid)
     defect = start - determinant(gradient) * _moved(end, u, grid)
     slide = _slide(defect, grid) / start
-    move = _tangential((gradient * slide.unsqueeze(1)).sum(dim=2), grid)
+    move = matrix_times(gradient, slide).masked_fill(fixed_unknowns("slip", grid, u.device), 0)
     return u + _open_share(u, move, start, end, grid) * move
 
 
@@ -99,10 +99,5 @@ def _moved(density: Tensor, u: Tensor, grid: Grid) -> Tensor:
     corners = torch.cat([density, (nodes * slope).sum(1, keepdim=True), slope], dim=1)
     linear, offset, slope = warp(corners, u, grid).split([1, 1, grid.dim], dim=1)
     value = linear + (((nodes + u) * slope).sum(1, keepdim=True) - offset) / 2
-    low, high = (bound.view(-1, *[1] * (grid.dim + 1)) for bound in density.detach().flatten(1).aminmax(dim=1))
+    low, high = (per_item(bound, density) for bound in density.detach().flatten(1).aminmax(dim=1))
     return value.clamp(low / 2, high * 2)
-
-
-def _tangential(move: Tensor, grid: Grid) -> Tensor:
-    """Return the move with the normal component on the boundary set to exactly zero."""
-    return move.masked_fill(fixed_unknowns("slip", grid, move.device), 0)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchdeform.core.derivatives import divergence, jacobian
 from torchdeform.core.grid import Grid
-from torchdeform.errors import InputError, require_choice
+from torchdeform.errors import InputError, require_choice, require_ranges
 from torchdeform.solvers.sine_cosine import inverse_transform, transform
 
 Mean = Literal["mean", "reciprocal_mean"]
@@ -51,8 +51,7 @@ class MonitorSettings:
             raise InputError(
                 f"MonitorSettings: need 0 < f_min <= f_max, both finite, got f_min={self.f_min}, f_max={self.f_max}"
             )
-        if not 0 <= self.smoothing < math.inf:
-            raise InputError(f"MonitorSettings: smoothing must be finite and not negative, got {self.smoothing}")
+        require_ranges(self, "MonitorSettings: ", smoothing="finite, not negative")
 
     def blend(self, closeness: Tensor) -> Tensor:
         """Return f_max − (f_max − f_min) · closeness, closeness being 1 where cells shall be smallest and 0 far off."""
@@ -256,8 +255,7 @@ def label_monitor(labels: Tensor, factors: Mapping[int, float], grid: Grid, smoo
     """
     values = labels if labels.dtype == torch.float64 else labels.to(torch.float32)
     grid.check_scalar(values, "label_monitor: labels")
-    if not factors or not all(math.isfinite(factor) and factor > 0 for factor in factors.values()):
-        raise InputError(f"label_monitor: factors must be positive and finite, one or more, got {dict(factors)}")
+    require_factors(factors, "label_monitor")
     taken = f = torch.zeros_like(values)
     for label, factor in factors.items():
         region = smooth((labels == label).to(values.dtype), grid, smoothing)
@@ -271,6 +269,12 @@ def label_monitor(labels: Tensor, factors: Mapping[int, float], grid: Grid, smoo
             "label_monitor: the factors leave the rest of the domain no volume; name fewer labels or lower the factors"
         )
     return f + rest * (1 - taken)
+
+
+def require_factors(factors: Mapping[int, float], where: str) -> None:
+    """Raise `InputError`, which names ``where``, unless there are factors, all positive and finite."""
+    if not factors or not all(0 < factor < math.inf for factor in factors.values()):
+        raise InputError(f"{where}: factors must be positive and finite, one or more, got {dict(factors)}")
 
 
 def smooth(field: Tensor, grid: Grid, sigma: float) -> Tensor:

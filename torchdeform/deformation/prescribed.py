@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -10,10 +11,10 @@ from torch import Tensor
 from torchdeform.core.derivatives import CURL_PAIRS, KERNELS, cofactors, jacobian
 from torchdeform.core.diagnostics import smallest_determinant
 from torchdeform.core.fold_free import largest_share
-from torchdeform.core.grid import Grid, per_item
+from torchdeform.core.grid import Grid, common_batch, per_item
 from torchdeform.deformation.finite_differences import Differences
 from torchdeform.deformation.monitors import require_positive
-from torchdeform.errors import InputError, require_choice
+from torchdeform.errors import InputError, require_choice, require_ranges
 from torchdeform.fem.boundary import fixed_unknowns
 from torchdeform.fem.div_curl import solve_div_curl
 from torchdeform.solvers.base import Solution, Status
@@ -52,8 +53,9 @@ class NewtonSettings:
     linear_steps: int = 500
 
     def __post_init__(self) -> None:
-        if (self.rtol or 0) < 0 or self.max_steps < 0 or self.linear_steps < 1:
-            raise InputError("NewtonSettings: rtol and max_steps must not be negative, linear_steps at least 1")
+        require_ranges(
+            self, "NewtonSettings: ", rtol="not negative", max_steps="not negative", linear_steps="at least 1"
+        )
 
 
 @dataclass(frozen=True)
@@ -128,8 +130,7 @@ def from_jacobian_and_curl(
     return descent.solution(value)
 
 
-@dataclass(frozen=True)
-class _State:
+class _State(NamedTuple):
     """A map and how far it is off, one entry per item: u, ∇φ, data − rows, and the norm of that."""
 
     u: Tensor
@@ -138,12 +139,11 @@ class _State:
     norm: Tensor
 
     def take(self, index: Tensor) -> "_State":
-        return _State(self.u[index], self.matrix[index], self.left[index], self.norm[index])
+        return _State(*(part[index] for part in self))
 
     def choose(self, index: Tensor, other: "_State") -> "_State":
         """Return the state with the items ``index`` replaced."""
-        pairs = ((self.u, other.u), (self.matrix, other.matrix), (self.left, other.left), (self.norm, other.norm))
-        return _State(*(mine.index_copy(0, index, new) for mine, new in pairs))
+        return _State(*(mine.index_copy(0, index, new) for mine, new in zip(self, other, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -239,10 +239,8 @@ def _problem(f: Tensor, curl: Tensor, grid: Grid, values: Tensor | None, order: 
         raise InputError("from_jacobian_and_curl: all must be float32, or all float64, on one device")
     if not all(bool(t.isfinite().all()) for t in given):
         raise InputError("from_jacobian_and_curl: curl and boundary_displacement must be finite")
-    batch = {t.shape[0] for t in given} - {1} or {1}
-    if len(batch) > 1:
-        raise InputError(f"from_jacobian_and_curl: batch sizes must agree or be 1, got {sorted(batch)}")
-    given = [t.expand(*batch, *t.shape[1:]) for t in given]
+    batch = common_batch("from_jacobian_and_curl", *given)
+    given = [t.expand(batch, *t.shape[1:]) for t in given]
     fixed = fixed_unknowns("dirichlet", grid, f.device)
     return _Problem(Differences(grid, order), torch.cat(given[:2], dim=1), (*given[2:], None)[0], fixed)
 
@@ -296,7 +294,7 @@ class _Descent:
         slope = adjoint(now.left, factors)
         # CG has one tolerance for all items: each is scaled so that it is 1.
         unit = (self._forcing(now, index) * dots(slope, slope).sqrt()).clamp(min=torch.finfo(slope.dtype).tiny)
-        unit = unit.view(-1, *[1] * (slope.dim() - 1))
+        unit = per_item(unit, slope)
         solution = conjugate_gradient(
             lambda v: adjoint(rows(v, factors), factors),
             slope / unit,

@@ -18,14 +18,14 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from torchdeform.core.flow import OdeSolver, integrate_points
+from torchdeform.core.flow import OdeSolver, integrate_points, require_times
 from torchdeform.core.fold_free import repair_folds
-from torchdeform.core.grid import Grid
+from torchdeform.core.grid import Grid, common_batch, per_item
 from torchdeform.core.warp import max_voxels, sample
 from torchdeform.deformation.corrections import correct_determinant
 from torchdeform.deformation.monitors import mean_value, normalise_monitor, require_positive
 from torchdeform.deformation.velocity import VelocityName, find_velocity
-from torchdeform.errors import ComputationError, InputError
+from torchdeform.errors import ComputationError, InputError, require_ranges
 from torchdeform.fem.boundary import fixed_unknowns
 
 # A monitor in time: t -> f (B, 1, *S), or its values at the times asked for, (T, B, 1, *S).
@@ -51,8 +51,8 @@ class DeformationSettings:
     remove_folds: bool = True
 
     def __post_init__(self) -> None:
-        if not isinstance(self.corrections, int) or self.corrections < 0:
-            raise InputError(f"DeformationSettings: corrections must be 0 or more, got {self.corrections!r}")
+        count = (lambda x: isinstance(x, int) and x >= 0, "be 0 or more")
+        require_ranges(self, "DeformationSettings: ", corrections=count)
 
 
 _STILL = DeformationSettings()
@@ -134,7 +134,7 @@ def grid_from_target_monitor(
     if g is None:
         return _from_identity(torch.ones_like(end), end, grid, velocity, curl, settings)
     require_positive(g, grid, "grid_from_target_monitor: g")
-    _batch_size(f, g)
+    common_batch("deformation", f, g)
     start = 1 / g
     return _from_identity(start, end * mean_value(start, grid), grid, velocity, curl, settings)
 
@@ -189,7 +189,7 @@ def track_moving_monitor(
         moments = [begin + (end - begin) * part / parts for part in range(parts)]
         for earlier, later in pairwise([*moments, end]):
             then = _density_at(f_of_t, grid, times, later)
-            _batch_size(now, then)
+            common_batch("deformation", now, then)
             v = find_velocity(now - then, grid, velocity, curl=None if curl is None else curl * (later - earlier))
             u, now = _follow(u, now, then, v, grid, solver), then
         u = _finish(u, torch.ones_like(now), now, grid, settings)
@@ -219,7 +219,7 @@ def _finish(u: Tensor, start: Tensor, end: Tensor, grid: Grid, settings: Deforma
 
 def _follow(u: Tensor, start: Tensor, end: Tensor, v: Tensor, grid: Grid, solver: OdeSolver) -> Tensor:
     """Return u after dφ/ds = v(φ)/((1 − s) ρ0(φ) + s ρ1(φ)) from s = 0 to 1; boundary nodes stay on their faces."""
-    batch, dim = _batch_size(u, v, start, end), grid.dim
+    batch, dim = common_batch("deformation", u, v, start, end), grid.dim
     fields = torch.cat([part.expand(batch, -1, *grid.shape) for part in (v, start, end)], dim=1)
     on_face, clock = fixed_unknowns("slip", grid, v.device), _clock(start, end)
 
@@ -243,8 +243,7 @@ def _clock(start: Tensor, end: Tensor) -> Callable[[Tensor], tuple[Tensor, Tenso
     the logarithms of the two extreme cell sizes differ by an amount proportional to t.
     """
     ratio = (end / start).flatten(1)
-    column = (-1, *[1] * (start.dim() - 1))
-    most, least = ratio.amax(1).clamp(min=1.01).view(column), ratio.amin(1).clamp(max=0.99).view(column)
+    most, least = per_item(ratio.amax(1).clamp(min=1.01), start), per_item(ratio.amin(1).clamp(max=0.99), start)
     rate = torch.log(most / least)
 
     def clock(t: Tensor) -> tuple[Tensor, Tensor]:
@@ -255,18 +254,9 @@ def _clock(start: Tensor, end: Tensor) -> Callable[[Tensor], tuple[Tensor, Tenso
     return clock
 
 
-def _batch_size(*tensors: Tensor) -> int:
-    sizes = {tensor.shape[0] for tensor in tensors} - {1} or {1}
-    if len(sizes) > 1:
-        raise InputError(f"deformation: batch sizes must agree or be 1, got {sorted(sizes)}")
-    return sizes.pop()
-
-
 def _checked_times(f_of_t: MovingMonitor, times: Sequence[float]) -> list[float]:
     times = [float(t) for t in times]
-    steps = [later - earlier for earlier, later in pairwise(times)]
-    if not steps or not (all(step > 0 for step in steps) or all(step < 0 for step in steps)):
-        raise InputError(f"track_moving_monitor: times must be two or more, increasing or decreasing, got {times}")
+    require_times(times, "track_moving_monitor")
     if not callable(f_of_t) and len(f_of_t) != len(times):
         raise InputError(f"track_moving_monitor: f_of_t has {len(f_of_t)} monitors for {len(times)} times")
     return times

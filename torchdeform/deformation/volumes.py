@@ -13,7 +13,7 @@ from torchdeform.core.diagnostics import smallest_determinant
 from torchdeform.core.flow import OdeSolver, integrate_points
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import sample
-from torchdeform.deformation.monitors import mean_value, smooth
+from torchdeform.deformation.monitors import mean_value, require_factors, smooth
 from torchdeform.deformation.versions import grid_from_initial_monitor
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.fem.boundary import fixed_unknowns
@@ -221,8 +221,7 @@ class _Regions:
 
     def _map(self, amplitudes: Tensor) -> Tensor:
         """Return the displacement for log f = Σ a χ."""
-        column = (*amplitudes.shape, *[1] * self.grid.dim)
-        f = (amplitudes.view(column) * self.smoothed).sum(dim=1, keepdim=True).exp()
+        f = torch.einsum("br,br...->b...", amplitudes, self.smoothed).unsqueeze(1).exp()
         if self.rigid is None:
             return grid_from_initial_monitor(f, self.grid)
         free = (~self.rigid).to(f.dtype)
@@ -233,8 +232,7 @@ class _Regions:
 def _indicators(labels: Tensor, factors: Mapping[int, float], rigid: Tensor | None) -> Tensor:
     """Return the mask of each region, ``(B, R, *S)``, the last one the rest."""
     where = "simulate_volume_change"
-    if not factors or not all(math.isfinite(f) and f > 0 for f in factors.values()):
-        raise InputError(f"{where}: factors must be positive and finite, one or more, got {dict(factors)}")
+    require_factors(factors, where)
     inside = torch.cat([labels == label for label in factors], dim=1)
     rigid = torch.zeros_like(inside[:, :1]) if rigid is None else rigid
     for label, region in zip(factors, inside.split(1, dim=1), strict=True):

@@ -66,8 +66,7 @@ def _by_neighbours(form: Form, grid: Grid, device: torch.device | str) -> Tensor
 
 def _neighbours(grid: Grid, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return by how much the number of each neighbour differs ``(3^D,)``, and where it exists ``(N, 3^D)``."""
-    strides = [math.prod(grid.shape[axis + 1 :]) for axis in range(grid.dim)]
-    shift = [sum(o * s for o, s in zip(offset, strides, strict=True)) for offset in _OFFSETS[grid.dim]]
+    shift = [sum(o * s for o, s in zip(offset, grid.strides, strict=True)) for offset in _OFFSETS[grid.dim]]
     inside = torch.ones(*grid.shape, len(shift), dtype=torch.bool, device=device)
     for k, offset in enumerate(_OFFSETS[grid.dim]):
         for axis, step in enumerate(offset):

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.derivatives import CURL_PAIRS
-from torchdeform.core.grid import Grid
+from torchdeform.core.grid import Grid, common_batch, per_item
 from torchdeform.errors import InputError
 from torchdeform.fem.boundary import Boundary, normal_is_given, outward_flux
 from torchdeform.fem.fast_transform import solve_poisson
@@ -82,7 +82,7 @@ def solve_div_curl(
     alpha, beta, values = (given.get(name) for name in ("div", "curl", "boundary_values"))
     alpha = like.new_zeros(len(like), 1, *grid.shape) if alpha is None else alpha
     incompatibility = _incompatibility(alpha, values, grid, boundary)
-    alpha = alpha - incompatibility.view(-1, *[1] * (grid.dim + 1))
+    alpha = alpha - per_item(incompatibility, alpha)
     system = DivCurlSystem(grid, weights.to(like), boundary)
     load = system.load(div=alpha, curl=beta, values=values)
     found = solver_of(how, system).init(system, like).solution(load)
@@ -128,10 +128,8 @@ def _given(
     for name, tensor in given.items():
         grid.check(tensor, f"solve_div_curl: {name}", components=channels[name])
     _require_one_kind(given)
-    batch = {t.shape[0] for t in (*given.values(), *weights.tensors) if t.dim() > 0} - {1} or {1}
-    if len(batch) > 1:
-        raise InputError(f"solve_div_curl: batch sizes must agree or be 1, got {sorted(batch)}")
-    return {n: t.expand(*batch, *t.shape[1:]) for n, t in given.items()}
+    batch = common_batch("solve_div_curl", *given.values(), *weights.tensors)
+    return {n: t.expand(batch, *t.shape[1:]) for n, t in given.items()}
 
 
 def _require_one_kind(given: dict[str, Tensor]) -> None:

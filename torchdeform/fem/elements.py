@@ -47,12 +47,6 @@ def gauss_weight(grid: Grid) -> float:
     return grid.cell_volume / 2**grid.dim
 
 
-def gauss_points(grid: Grid) -> Tensor:
-    """Return where the Gauss points lie from corner 0 of their element, ``(2^D, D)`` float64 in units of spacing."""
-    unit = torch.cartesian_prod(*[torch.tensor(GAUSS, dtype=torch.float64)] * grid.dim)
-    return unit * torch.tensor(grid.spacing, dtype=torch.float64)
-
-
 def components(form: Form) -> int:
     """Return the number of components of the fields that a form takes."""
     return 1 + max(term.component for row in form for term in row.terms)

@@ -118,7 +118,8 @@ class TransformFactor(Factor):
             free = self.system.free(load)
             norm, left = (t.flatten(1).norm(dim=1) for t in (free, free - self.system.apply(value)))
         met, finite = left <= torch.clamp(self.rtol * norm, min=self.atol), torch.isfinite(left)
-        status = tuple(_judge(*flags) for flags in zip(met.tolist(), finite.tolist(), strict=True))
+        codes = torch.where(finite, met.long(), 2)
+        status = tuple((Status.ROUNDING, Status.CONVERGED, Status.NON_FINITE)[code] for code in codes.tolist())
         steps = torch.zeros(load.shape[0], dtype=torch.int64, device=load.device)
         return Solution(value, status, steps, torch.where(norm > 0, left / norm, 0))
 
@@ -130,12 +131,6 @@ class TransformFactor(Factor):
             with torch.inference_mode(False):
                 self._workspace = load.new_empty(load.shape)
         return self._workspace
-
-
-def _judge(met: bool, finite: bool) -> Status:
-    if not finite:
-        return Status.NON_FINITE
-    return Status.CONVERGED if met else Status.ROUNDING
 
 
 def is_exact_for(system: DivCurlSystem) -> bool:

@@ -9,8 +9,8 @@ from torch import Tensor
 from torchdeform.core.derivatives import CURL_PAIRS
 from torchdeform.fem.weights import Weights
 
-# A number, or a tensor (B or 1, Q, *E): Q = 1 for one value per element, Q = 2^D for one per Gauss point of it (corner
-# order, see `elements.gauss_points`); E_k = n_k − 1 elements along axis k, or 1 where it does not vary.
+# A number, or a tensor (B or 1, Q, *E): Q = 1 for one value per element, Q = 2^D for one per Gauss point of it (in the
+# order of its corners); E_k = n_k − 1 elements along axis k, or 1 where it does not vary.
 Coefficient = float | Tensor
 
 

@@ -2,17 +2,17 @@
 
 from dataclasses import dataclass
 
-from torchdeform.errors import InputError, require_choice
+from torchdeform.errors import require_choice, require_ranges
 from torchdeform.fem.fast_transform import FastTransform, is_exact_for
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.solvers.base import LinearSolver
-from torchdeform.solvers.cg import ConjugateGradient, Jacobi
+from torchdeform.solvers.cg import ConjugateGradient, jacobi
 
 # A matrix of more entries (see `DivCurlSystem.matrix_entries`) is not assembled: that would take more than 6 GB.
 LARGEST_MATRIX = 2**26
 
 METHODS = ("auto", "transform", "cg", "assembled")
-PRECONDITIONERS = ("transform", "jacobi", "none")
+PRECONDITIONERS = {"transform": FastTransform(approximate=True).init, "jacobi": jacobi, "none": None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,8 +43,7 @@ class SolverSettings:
     def __post_init__(self) -> None:
         require_choice(self.method, METHODS, "solver")
         require_choice(self.preconditioner, PRECONDITIONERS, "solver.preconditioner")
-        if (self.rtol or 0) < 0 or self.atol < 0 or self.max_steps < 0:
-            raise InputError("solver: rtol, atol and max_steps must not be negative")
+        require_ranges(self, "solver.", rtol="not negative", atol="not negative", max_steps="not negative")
 
 
 def solver_of(settings: SolverSettings | str, system: DivCurlSystem) -> LinearSolver:
@@ -56,10 +55,9 @@ def solver_of(settings: SolverSettings | str, system: DivCurlSystem) -> LinearSo
     how = settings if isinstance(settings, SolverSettings) else SolverSettings(method=settings)
     if how.method == "transform" or (how.method == "auto" and is_exact_for(system)):
         return FastTransform(rtol=how.rtol, atol=how.atol)
-    preconditioners = {"transform": FastTransform(approximate=True), "jacobi": Jacobi(), "none": None}
     return ConjugateGradient(
         assembled=how.method == "assembled" and system.matrix_entries <= LARGEST_MATRIX,
-        preconditioner=preconditioners[how.preconditioner],
+        preconditioner=PRECONDITIONERS[how.preconditioner],
         rtol=how.rtol,
         atol=how.atol,
         max_steps=how.max_steps,

@@ -9,7 +9,7 @@ from torchdeform.core.grid import per_item
 from torchdeform.errors import InputError
 
 # Axes of a batch of images, in 2D and in 3D.
-_DIMENSIONS = (4, 5)
+DIMENSIONS = (4, 5)
 
 # Intensities that are taken for 0 and 1; None: the smallest and the largest of each image.
 IntensityRange = tuple[float, float] | None
@@ -94,7 +94,7 @@ def checked(fixed: Tensor, warped: Tensor, mask: Tensor | None) -> tuple[Tensor,
         InputError: they are no floating-point ``(B, C, *S)`` of one shape with 2 or 3 axes in S, or the mask does not
             fit.
     """
-    if fixed.shape != warped.shape or fixed.dim() not in _DIMENSIONS:
+    if fixed.shape != warped.shape or fixed.dim() not in DIMENSIONS:
         shapes = f"{tuple(fixed.shape)} and {tuple(warped.shape)}"
         raise InputError(f"similarity: fixed and warped must have one shape (B, C, *S), got {shapes}")
     if not (fixed.is_floating_point() and warped.is_floating_point()):

@@ -8,15 +8,13 @@ from torch import Tensor
 
 from torchdeform.core.resampling import box_sum
 from torchdeform.errors import InputError
-from torchdeform.metrics.base import at_least_float32
+from torchdeform.metrics.base import DIMENSIONS, at_least_float32
 
 # V is kept within these shares of its mean over the image.
 _VARIANCE_RANGE = (1e-3, 1e3)
 
 # Differences below this many units in the last place of the largest value are noise.
 _ROUNDING = 256.0
-
-_DIMENSIONS = (2, 3)
 
 
 def mind_ssc(image: Tensor, *, radius: int = 1, dilation: int = 1) -> Tensor:
@@ -40,7 +38,7 @@ def mind_ssc(image: Tensor, *, radius: int = 1, dilation: int = 1) -> Tensor:
         boundary values. Differentiable. Heinrich et al., "Towards Realtime Multimodal Fusion for Image-Guided
         Interventions Using Self-Similarities", MICCAI 2013.
     """
-    if image.dim() - 2 not in _DIMENSIONS or not image.is_floating_point():
+    if image.dim() not in DIMENSIONS or not image.is_floating_point():
         raise InputError(
             f"mind_ssc: image must be floating-point (B, C, *S), got {tuple(image.shape)} of {image.dtype}"
         )

@@ -11,7 +11,7 @@ from torchdeform.core.derivatives import CURL_PAIRS
 from torchdeform.core.grid import Grid, per_item
 from torchdeform.core.resampling import prolong
 from torchdeform.core.warp import invert
-from torchdeform.errors import InputError
+from torchdeform.errors import InputError, require_ranges
 from torchdeform.nn.heads import flow_to_monitor, scale_to_bounds, with_mean_one
 from torchdeform.nn.precision import full_precision
 from torchdeform.nn.spatial import SpatialTransformer
@@ -79,16 +79,12 @@ class RandomDeformation(nn.Module):
         outside: float | None = None,
     ) -> None:
         super().__init__()
-        if not (0 < determinant[0] < 1 < determinant[1] < math.inf and 0 <= curl < math.inf):
-            raise InputError(
-                f"RandomDeformation: determinant needs 0 < low < 1 < high, curl at least 0, got {determinant}, {curl}"
-            )
-        if nodes < 2 or not 0 <= probability <= 1:
-            raise InputError(
-                f"RandomDeformation: nodes must be at least 2 and probability 0 to 1, got {nodes}, {probability}"
-            )
+        if not 0 < determinant[0] < 1 < determinant[1] < math.inf:
+            raise InputError(f"RandomDeformation: determinant needs 0 < low < 1 < high, got {determinant}")
         self.grid, self.determinant, self.curl = grid, (float(determinant[0]), float(determinant[1])), float(curl)
         self.nodes, self.probability = nodes, probability
+        several = (lambda n: n >= 2, "be at least 2")
+        require_ranges(self, "RandomDeformation: ", curl="finite, not negative", nodes=several, probability="0 to 1")
         self.carry = SpatialTransformer(grid, outside=outside)
 
     @torch.no_grad()
@@ -143,8 +139,8 @@ class RandomDeformation(nn.Module):
 
     @full_precision
     def _maps(self, noise: Tensor) -> Tensor:
-        shape = tuple(min(n, _REFINEMENT * (m - 1) + 1) for n, m in zip(self.grid.shape, noise.shape[2:], strict=True))
-        grid = Grid(shape, tuple(side / (n - 1) for side, n in zip(self.grid.extent, shape, strict=True)))
+        counts = zip(self.grid.shape, noise.shape[2:], strict=True)
+        grid = self.grid.with_shape([min(n, _REFINEMENT * (m - 1) + 1) for n, m in counts])
         noise, (low, high) = prolong(noise, grid), self.determinant
         rising = noise[:, :1].clamp(min=0) * math.log(high)
         falling = noise[:, :1].clamp(max=0) * -math.log(low)

@@ -85,12 +85,16 @@ def from_grid_sample(positions: Tensor, grid: Grid, *, displacement: bool = Fals
     Raises:
         InputError: shape.
     """
-    if not isinstance(positions, Tensor) or tuple(positions.shape[1:]) != (*grid.shape, grid.dim):
-        want = ", ".join(map(str, (*grid.shape, grid.dim)))
-        raise InputError(f"from_grid_sample: positions must have shape (B, {want}), got {tuple(positions.shape)}")
+    _check_last(positions, grid, "from_grid_sample: positions")
     scaled = positions if displacement else positions - _box(grid, positions)
     u = scaled.movedim(-1, 1).flip(1)
     return u * grid.along(grid.extent, u) / 2
+
+
+def _check_last(vectors: Tensor, grid: Grid, name: str) -> None:
+    if not isinstance(vectors, Tensor) or tuple(vectors.shape[1:]) != (*grid.shape, grid.dim):
+        want = ", ".join(map(str, (*grid.shape, grid.dim)))
+        raise InputError(f"{name} must have shape (B, {want}), got {tuple(vectors.shape)}")
 
 
 def _box(grid: Grid, like: Tensor) -> Tensor:
@@ -132,9 +136,7 @@ def from_itk(vectors: Tensor, grid: Grid, direction: Sequence[Sequence[float]] =
     Raises:
         InputError: shape, or a direction of another size.
     """
-    if not isinstance(vectors, Tensor) or tuple(vectors.shape[1:]) != (*grid.shape, grid.dim):
-        want = ", ".join(map(str, (*grid.shape, grid.dim)))
-        raise InputError(f"from_itk: vectors must have shape (B, {want}), got {tuple(vectors.shape)}")
+    _check_last(vectors, grid, "from_itk: vectors")
     back = torch.linalg.inv(_direction(direction, grid, vectors))
     return torch.einsum("ij,b...j->b...i", back, vectors).movedim(-1, 1).flip(1)
 

@@ -11,7 +11,7 @@ from torchdeform.core.flow import OdeSolver, integrate_rate
 from torchdeform.core.grid import Grid, per_item
 from torchdeform.core.resampling import prolong
 from torchdeform.core.warp import warp
-from torchdeform.errors import InputError
+from torchdeform.errors import InputError, require_ranges
 from torchdeform.nn.operators import div_curl_velocity, share_within_bounds
 from torchdeform.nn.precision import full_precision
 
@@ -60,12 +60,10 @@ class JacobianCurlHead(nn.Module):
         least: float = 0.01,
     ) -> None:
         super().__init__()
-        if not (1 < ratio < math.inf and 0 < curl < math.inf and steps >= 1 and 0 < least < 1):
-            raise InputError(
-                "JacobianCurlHead: ratio must be above 1, curl positive, steps at least 1, least between 0 and 1, got "
-                f"{ratio}, {curl}, {steps}, {least}"
-            )
         self.grid, self.ratio, self.curl, self.steps, self.least = grid, ratio, curl, steps, least
+        above_1 = (lambda x: 1 < x < math.inf, "be finite and above 1")
+        ranges = {"ratio": above_1, "curl": "positive", "steps": "at least 1", "least": "inside 0 to 1"}
+        require_ranges(self, "JacobianCurlHead: ", **ranges)
         self.conv = _CONV[grid.dim](channels, 1 + len(CURL_PAIRS[grid.dim]), 3, padding=1)
         nn.init.normal_(self.conv.weight, std=_FIRST_WEIGHTS)
         nn.init.zeros_(self.conv.bias)
@@ -98,19 +96,13 @@ class JacobianCurlHead(nn.Module):
     @full_precision
     def _bounded(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         monitor = torch.exp(math.log(self.ratio) * raw[:, :1].tanh())
-        return with_mean_one(monitor, self._grid_of(raw)), self.curl * raw[:, 1:].tanh()
+        return with_mean_one(monitor, self.grid.with_shape(raw.shape[2:])), self.curl * raw[:, 1:].tanh()
 
     @full_precision
     def deform(self, f: Tensor, curl: Tensor) -> Tensor:
         """Return u from the monitor and the curl that `fields` returns; arguments and result as there."""
-        u = prolong(flow_to_monitor(f, curl, self._grid_of(f), self.steps), self.grid)
+        u = prolong(flow_to_monitor(f, curl, self.grid.with_shape(f.shape[2:]), self.steps), self.grid)
         return scale_to_bounds(u, self.grid, self.least)
-
-    def _grid_of(self, field: Tensor) -> Grid:
-        shape = tuple(field.shape[2:])
-        if shape == self.grid.shape:
-            return self.grid
-        return Grid(shape, tuple(side / (n - 1) for side, n in zip(self.grid.extent, shape, strict=True)))
 
     def extra_repr(self) -> str:
         bounds = f"ratio={self.ratio:g}, curl={self.curl:g}, steps={self.steps}, least={self.least:g}"

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from torchdeform.core.derivatives import curl, divergence, jacobian_determinant
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import compose
-from torchdeform.errors import InputError, require_choice
+from torchdeform.errors import InputError, require_choice, require_ranges
 from torchdeform.metrics.similarity import MEASURES
 from torchdeform.nn.precision import full_precision
 
@@ -65,9 +65,8 @@ class DiceLoss(nn.Module):
 
     def __init__(self, smoothing: float = 1e-5) -> None:
         super().__init__()
-        if not smoothing > 0:
-            raise InputError(f"DiceLoss: smoothing must be positive, got {smoothing}")
         self.smoothing = smoothing
+        require_ranges(self, "DiceLoss: ", smoothing="positive")
 
     @full_precision
     def forward(self, fixed: Tensor, warped: Tensor) -> Tensor:

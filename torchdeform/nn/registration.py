@@ -9,7 +9,7 @@ from torch.utils.checkpoint import checkpoint
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import warp
-from torchdeform.errors import InputError, require_choice
+from torchdeform.errors import require_choice, require_ranges
 from torchdeform.metrics.similarity import INTENSITIES, MEASURES
 from torchdeform.nn.precision import full_precision
 from torchdeform.registration.optimise import Level, Objective, optimise_level
@@ -41,12 +41,11 @@ class DeformableRegistration(nn.Module):
     def __init__(self, grid: Grid, *, steps: int = 20, settings: RegistrationSettings | None = None) -> None:
         super().__init__()
         settings = settings or RegistrationSettings()
-        if steps < 1:
-            raise InputError(f"DeformableRegistration: steps must be at least 1, got {steps}")
         # Others compare features, which are warped in place of the image.
         measures = [name for name, measure in MEASURES.items() if measure.features is INTENSITIES]
         require_choice(settings.similarity.measure, measures, "DeformableRegistration: similarity")
         self.grid, self.steps, self.settings = grid, steps, settings
+        require_ranges(self, "DeformableRegistration: ", steps="at least 1")
 
     @full_precision
     def forward(self, fixed: Tensor, moving: Tensor, start: Tensor | None = None) -> Tensor:

@@ -9,7 +9,8 @@ from torch import Tensor
 from torchdeform.core.diagnostics import Diagnosis, diagnose, inverse_error, smallest_determinant
 from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid, limit_threads
-from torchdeform.core.image import Image, resample
+from torchdeform.core.image import Image, resample, same_place
+from torchdeform.core.intensities import require_finite
 from torchdeform.core.resampling import MIN_NODES, prolong
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import invert, warp
@@ -99,7 +100,7 @@ def _register_tensors(
 ) -> RegistrationResult:
     grid = _checked_grid(fixed, moving, guidance)
     problem = problem_of_tensors(fixed, moving, grid, guidance)
-    _require_finite(problem)
+    require_finite(problem.fixed, problem.moving, "register")
     problem = problem.scaled(settings)
     space = midspace_of_tensors(problem) if settings.symmetric else None
     found = _optimise(problem, space, settings, start, callback)
@@ -121,12 +122,6 @@ def _checked_grid(fixed: Tensor, moving: Tensor, guidance: Guidance) -> Grid:
     _require_size(grid)
     guidance.require_tensors(grid, fixed.shape[0])
     return grid
-
-
-def _require_finite(problem: RegistrationProblem) -> None:
-    for name, image in (("fixed", problem.fixed), ("moving", problem.moving)):
-        if not bool(image.isfinite().all()):
-            raise InputError(f"register: {name} has values that are NaN or infinite; replace or mask them first")
 
 
 def _require_size(grid: Grid) -> None:
@@ -181,8 +176,7 @@ def _midspace(
     settings: RegistrationSettings,
 ) -> MidSpace:
     """Return the space between two images; where they share a grid and a place it is theirs."""
-    places = [(s.image.grid, s.image.origin, s.image.direction) for s in (fixed, moving)]
-    if affine is None and places[0] == places[1]:
+    if affine is None and same_place(fixed.image, moving.image):
         return midspace_of_tensors(problem)
     space = midspace_of_images(fixed, moving, affine, common_axes(fixed.image, moving.image))
     return replace(space, problem=space.problem.scaled(settings))

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchdeform.core.flow import OdeSolver, flow
 from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid
+from torchdeform.core.intensities import require_finite
 from torchdeform.core.resampling import MIN_NODES, hat_average, prolong, pyramid_grids, restrict
 from torchdeform.core.warp import compose, warp
 from torchdeform.errors import InputError
@@ -83,9 +84,7 @@ def _check(fixed: Tensor, moving: Tensor, mask: Tensor | None, grid: Grid) -> No
         raise InputError("discrete_start: fixed and moving must agree in batch size, dtype and device")
     if min(grid.shape) < MIN_NODES:
         raise InputError(f"discrete_start: every axis must have at least {MIN_NODES} voxels, got {grid.shape}")
-    for name, image in (("fixed", fixed), ("moving", moving)):
-        if not bool(image.isfinite().all()):
-            raise InputError(f"discrete_start: {name} has values that are NaN or infinite; replace them first")
+    require_finite(fixed, moving, "discrete_start")
     if mask is not None and (tuple(mask.shape[1:]) != (1, *grid.shape) or len(mask) not in (1, len(fixed))):
         raise InputError(
             f"discrete_start: mask must have shape {(len(fixed), 1, *grid.shape)}, got {tuple(mask.shape)}"
@@ -135,10 +134,9 @@ class _Search:
 
 def _make_search(grid: Grid, level: int, reach: float, settings: DiscreteSettings) -> _Search:
     source, features = (pyramid_grids(grid, index + 1)[0] for index in (settings.levels[-1], level))
-    shape = tuple(min(n, max(3, round((n - 1) / settings.spacing) + 1)) for n in features.shape)
-    control = Grid(shape, tuple(side / (n - 1) for side, n in zip(grid.extent, shape, strict=True)))
+    control = grid.with_shape([min(n, max(3, round((n - 1) / settings.spacing) + 1)) for n in features.shape])
     steps = tuple(max(1, round(reach * min(grid.spacing) / h)) for h in features.spacing)
-    entries = math.prod(2 * r + 1 for r in steps) * math.prod(shape)
+    entries = math.prod(2 * r + 1 for r in steps) * math.prod(control.shape)
     if entries > _LARGEST_VOLUME:
         raise InputError(
             f"discrete_start: a reach of {reach:g} voxels on level {level} needs {entries:.1e} costs; "

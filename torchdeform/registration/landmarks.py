@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.warp import sample
+from torchdeform.core.warp import inverse_matrix, jacobian_at, matrix_times, sample, voxels
 
 # Newton's steps that bring the middle points to where they belong, at first and after every step of the maps.
 _FIRST, _AGAIN = 30, 3
@@ -26,7 +26,7 @@ class LandmarkForce:
         distance: mean squared distance of the pairs in squared units of spacing ``(B,)``.
         points: grid points ``(B, D, n)`` where the maps' domain is to be moved.
         residuals: the displacement wanted there, likewise.
-        slopes: Jacobian of the map there ``(B, n, D, D)``; None where the points move with the domain, and those of
+        slopes: Jacobian of the map there ``(B, D, D, n)``; None where the points move with the domain, and those of
             the two maps of a pair, half a batch apart, move against each other.
     """
 
@@ -37,16 +37,16 @@ class LandmarkForce:
 
     def load(self, grid: Grid) -> Tensor:
         """Return minus the derivative of ``distance`` by a velocity of the domain, at every node ``(B, D, *S)``."""
-        residuals = self.residuals if self.slopes is None else _times(self.slopes.transpose(2, 3), self.residuals)
+        residuals = self.residuals if self.slopes is None else matrix_times(self.slopes.transpose(1, 2), self.residuals)
         return scatter_points(residuals * (2 / residuals.shape[2]), self.points, grid)
 
     def line_search(self, v: Tensor, grid: Grid) -> Tensor:
         """Return the multiple of the velocity v that brings the pairs nearest to each other, ``(B,)``."""
         moved = sample(v, self.points, grid)
-        moved = moved - _of_other_map(moved) if self.slopes is None else _times(self.slopes, moved)
+        moved = moved - of_other_map(moved) if self.slopes is None else matrix_times(self.slopes, moved)
         work, square = ((x * moved).flatten(1).sum(1) for x in (self.residuals, moved))
         if self.slopes is None:  # the maps of a pair go the same way
-            work, square = work + _of_other_map(work), square + _of_other_map(square)
+            work, square = work + of_other_map(work), square + of_other_map(square)
         return work / square.clamp(min=torch.finfo(v.dtype).tiny)
 
 
@@ -72,7 +72,7 @@ class ForwardLandmarks(Landmarks):
 
     def evaluate(self, u: Tensor) -> LandmarkForce:
         residuals = self.moving - _mapped(u, self.fixed, self.grid)
-        return LandmarkForce(_mean_square(residuals), self.fixed, residuals, _slopes(u, self.fixed, self.grid))
+        return LandmarkForce(_mean_square(residuals), self.fixed, residuals, jacobian_at(u, self.fixed, self.grid))
 
 
 class MidspaceLandmarks(Landmarks):
@@ -94,15 +94,14 @@ class MidspaceLandmarks(Landmarks):
     def evaluate(self, u: Tensor) -> LandmarkForce:
         for _ in range(self.steps):
             defect = self.ends - _mapped(u, self.points, self.grid)
-            leap = _solved(_slopes(u, self.points, self.grid), defect)
-            voxels = (leap / leap.new_tensor(self.grid.spacing).view(1, -1, 1)).norm(dim=1, keepdim=True)
-            self.points = self.points + leap * (_LEAP / voxels.clamp(min=_LEAP))
+            leap = matrix_times(inverse_matrix(jacobian_at(u, self.points, self.grid)), defect)
+            self.points = self.points + leap * (_LEAP / voxels(leap, self.grid).clamp(min=_LEAP))
         self.steps = _AGAIN
-        residuals = self.points - _of_other_map(self.points)  # φ ∘ flow(v) takes to p what was at v from there
+        residuals = self.points - of_other_map(self.points)  # φ ∘ flow(v) takes to p what was at v from there
         return LandmarkForce(_mean_square(residuals), self.points, residuals)
 
 
-def _of_other_map(values: Tensor) -> Tensor:
+def of_other_map(values: Tensor) -> Tensor:
     """Return for each map of a pair what belongs to the other, half a batch away."""
     return values.roll(len(values) // 2, 0)
 
@@ -118,15 +117,15 @@ def scatter_points(values: Tensor, points: Tensor, grid: Grid) -> Tensor:
     Returns:
         ``(B, C, *S)``. The order of summation is fixed, so the result is, too.
     """
-    last = points.new_tensor([n - 1 for n in grid.shape]).view(1, -1, 1)
-    place = (points / points.new_tensor(grid.spacing).view(1, -1, 1)).clamp(min=0).minimum(last)
+    last = grid.along([n - 1 for n in grid.shape], points)
+    place = (points / grid.along(grid.spacing, points)).clamp(min=0).minimum(last)
     first = place.floor().minimum(last - 1)
     share, first = place - first, first.long()
-    strides = torch.tensor([math.prod(grid.shape[k + 1 :]) for k in range(grid.dim)], device=points.device)
+    strides = grid.along(grid.strides, first)
     nodes, parts = [], []
     for corner in product((0, 1), repeat=grid.dim):
-        ends = torch.tensor(corner, device=points.device).view(1, -1, 1)
-        nodes.append(((first + ends) * strides.view(1, -1, 1)).sum(1))
+        ends = grid.along(corner, first)
+        nodes.append(((first + ends) * strides).sum(1))
         parts.append(values * torch.where(ends > 0, share, 1 - share).prod(1, keepdim=True))
     return _summed(torch.cat(parts, dim=2), torch.cat(nodes, dim=1), grid)
 
@@ -145,25 +144,6 @@ def _summed(parts: Tensor, nodes: Tensor, grid: Grid) -> Tensor:
 
 def _mapped(u: Tensor, points: Tensor, grid: Grid) -> Tensor:
     return points + sample(u, points, grid)
-
-
-def _slopes(u: Tensor, points: Tensor, grid: Grid) -> Tensor:
-    """Return ∇φ at the points by differences over two voxels, ``(B, n, D, D)``."""
-    columns = []
-    for axis, h in enumerate(grid.spacing):
-        step = torch.zeros_like(points)
-        step[:, axis] = h
-        difference = _mapped(u, points + step, grid) - _mapped(u, points - step, grid)
-        columns.append(difference.transpose(1, 2) / (2 * h))
-    return torch.stack(columns, dim=3)
-
-
-def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
-    return torch.einsum("bnij,bjn->bin", matrices, vectors)
-
-
-def _solved(matrices: Tensor, vectors: Tensor) -> Tensor:
-    return torch.linalg.solve_ex(matrices, vectors.transpose(1, 2).unsqueeze(3))[0].squeeze(3).transpose(1, 2)
 
 
 def _mean_square(residuals: Tensor) -> Tensor:

@@ -29,7 +29,6 @@ from torchdeform.registration.velocity import (
     fold_barrier,
     image_force,
     normalise_step,
-    points_scale,
     step_size,
 )
 
@@ -215,10 +214,8 @@ def optimise_levels(
 
 def forward_objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
     """Return what is maximised where the moving image is warped onto the fixed one, the map being on ``grid``."""
-    landmarks = None
-    if settings.points_weight > 0 and problem.fixed_points is not None and problem.moving_points is not None:
-        landmarks = ForwardLandmarks(problem.fixed_points, problem.moving_points, grid)
-    return Objective(forward_similarity(problem, settings), landmarks)
+    pairs = problem.pairs if settings.points_weight > 0 else None
+    return Objective(forward_similarity(problem, settings), pairs and ForwardLandmarks(*pairs, grid))
 
 
 def make_level(
@@ -288,7 +285,8 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     force = image_force(slope, warped, objective.similarity.grid, settings.stencil)
     del warped, slope  # before the next are made
     force = force if level.transfer is None else level.transfer.gather(force)
-    load = None if points is None else points.load(grid) * points_scale(settings.points_weight, grid)
+    scale = settings.points_weight * math.prod(grid.shape)  # to the unit of N ∂S/∂warped
+    load = None if points is None else points.load(grid) * scale
     # 3. Least squares: div and curl of the velocity are paid for, nearly folded places ask for divergence.
     barrier = fold_barrier(state.lowest, settings.folds.soft_determinant)
     v = normalise_step(objective.coupling.velocity(level.metric.ascent(force, barrier, load)), grid)

@@ -63,8 +63,7 @@ class Guidance:
     @property
     def points(self) -> tuple[Tensor, Tensor] | None:
         """The landmarks of both images, None without."""
-        first, second = self.fixed_points, self.moving_points
-        return None if first is None or second is None else (first, second)
+        return _both(self.fixed_points, self.moving_points)
 
     def require_tensors(self, grid: Grid, items: int) -> None:
         """Raise `InputError` unless everything given is a tensor that goes with images ``(items, C, *S)``."""
@@ -112,6 +111,11 @@ class RegistrationProblem:
     moving_mask: Tensor | None = None
     fixed_points: Tensor | None = None
     moving_points: Tensor | None = None
+
+    @property
+    def pairs(self) -> tuple[Tensor, Tensor] | None:
+        """The landmarks of both images, None without."""
+        return _both(self.fixed_points, self.moving_points)
 
     def on(self, coarse: Grid) -> "RegistrationProblem":
         """Return the problem on a coarser grid of the same box."""
@@ -223,6 +227,10 @@ def _mask_on(frame: Image, placed: PlacedImage) -> Tensor | None:
     mask = replace(image, data=torch.ones_like(image.data[:, :1])) if mask is None else mask
     weights = resample(mask, frame)
     return None if bool((weights == 1).all()) else weights
+
+
+def _both(first: Tensor | None, second: Tensor | None) -> tuple[Tensor, Tensor] | None:
+    return None if first is None or second is None else (first, second)
 
 
 def _require_pairs(fixed: Tensor, moving: Tensor) -> None:

@@ -1,11 +1,10 @@
 """Settings of a registration, nested by subject: typed, frozen, checked when made."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from torchdeform.core.flow import OdeSolver
-from torchdeform.errors import InputError, require_choice
+from torchdeform.errors import RANGES, InputError, require_choice, require_ranges
 from torchdeform.fem.solver import SolverSettings
 from torchdeform.metrics.similarity import similarity_weights
 from torchdeform.registration.affine.settings import AlignmentSettings
@@ -37,8 +36,7 @@ class SimilaritySettings:
         similarity_weights(self.measure)
         if not isinstance(self.measure, str):  # a copy of our own, and a dict, which `asdict` can take
             object.__setattr__(self, "measure", dict(self.measure))
-        if self.window < 3 or self.window % 2 == 0:
-            raise InputError(f"similarity.window must be an odd number of voxels, at least 3, got {self.window}")
+        require_ranges(self, "similarity.", window="window")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,17 +64,11 @@ class MetricSettings:
     elasticity: float = 0.2
 
     def __post_init__(self) -> None:
-        lengths = self._lengths
-        if not lengths or not all(0 < length < math.inf for length in lengths):
-            wanted = "positive and finite, one number or one for each level"
-            raise InputError(f"metric.length_scale must be {wanted}, got {self.length_scale}")
-        for name in ("weight_div", "weight_curl"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"metric.{name} must be positive and finite, got {getattr(self, name)}")
-        if self.order not in (1, 2):
-            raise InputError(f"metric.order must be 1 or 2, got {self.order}")
-        if not 0 <= self.elasticity <= 1:
-            raise InputError(f"metric.elasticity must lie between 0 and 1, got {self.elasticity}")
+        require_choice(self.order, (1, 2), "metric.order")
+        lengths = (RANGES["positive"][0], f"{RANGES['positive'][1]}, one number or one for each level")
+        require_ranges(
+            self, "metric.", length_scale=lengths, weight_div="positive", weight_curl="positive", elasticity="0 to 1"
+        )
 
     @property
     def _lengths(self) -> tuple[float, ...]:
@@ -112,16 +104,15 @@ class OptimiserSettings:
     map_spacing: float = 2.0
 
     def __post_init__(self) -> None:
-        if not self.steps or min(self.steps) < 0:
-            raise InputError(f"optimiser.steps must hold one number per level, none negative, got {self.steps}")
-        if not 0 < self.step_length < math.inf:
-            raise InputError(f"optimiser.step_length must be positive and finite, got {self.step_length}")
-        if not 0 <= self.momentum < 1:
-            raise InputError(f"optimiser.momentum must be at least 0 and below 1, got {self.momentum}")
-        if not 0 <= self.tolerance < math.inf:
-            raise InputError(f"optimiser.tolerance must be finite and not negative, got {self.tolerance}")
-        if not 1 <= self.map_spacing <= 8:
-            raise InputError(f"optimiser.map_spacing must lie between 1 and 8 voxels, got {self.map_spacing}")
+        require_ranges(
+            self,
+            "optimiser.",
+            steps=(RANGES["not negative"][0], "hold one number per level, none negative"),
+            step_length="positive",
+            momentum="below 1",
+            tolerance="finite, not negative",
+            map_spacing=(lambda spacing: 1 <= spacing <= 8, "lie between 1 and 8 voxels"),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,10 +132,7 @@ class FoldSettings:
     min_determinant: float = 0.03
 
     def __post_init__(self) -> None:
-        if not 0 <= self.soft_determinant < math.inf:
-            raise InputError(f"folds.soft_determinant must be finite and not negative, got {self.soft_determinant}")
-        if not 0 < self.min_determinant < 1:
-            raise InputError(f"folds.min_determinant must lie between 0 and 1, got {self.min_determinant}")
+        require_ranges(self, "folds.", soft_determinant="finite, not negative", min_determinant="inside 0 to 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,23 +173,13 @@ class DiscreteSettings:
             raise InputError(f"discrete.levels must not be negative and run from coarse to fine, got {self.levels}")
         if not self.coupling:
             raise InputError("discrete.coupling must have at least one price")
-        positive = {"reach": self.reach, "coupling": self.coupling}
-        positive |= {name: (getattr(self, name),) for name in ("smoothing", "length_scale", "min_determinant")}
-        for name, values in positive.items():
-            if not all(0 < value < math.inf for value in values):
-                raise InputError(f"discrete.{name} must be positive and finite, got {getattr(self, name)}")
-        if not 1 <= self.spacing < math.inf:
-            raise InputError(f"discrete.spacing must be at least 1, got {self.spacing}")
-        if self.min_determinant >= 1:
-            raise InputError(f"discrete.min_determinant must be below 1, got {self.min_determinant}")
+        positive = dict.fromkeys(("reach", "coupling", "smoothing", "length_scale", "min_determinant"), "positive")
+        require_ranges(self, "discrete.", spacing="at least 1", **positive)
+        require_ranges(self, "discrete.", min_determinant="below 1")
 
 
-_ALIGN, _DISCRETE, _SIMILARITY, _METRIC = (
-    AlignmentSettings(),
-    DiscreteSettings(),
-    SimilaritySettings(),
-    MetricSettings(),
-)
+_ALIGN, _DISCRETE = AlignmentSettings(), DiscreteSettings()
+_SIMILARITY, _METRIC = SimilaritySettings(), MetricSettings()
 _SOLVER, _FLOW = SolverSettings(), OdeSolver(method="midpoint", steps=1)
 _OPTIMISER, _FOLDS = OptimiserSettings(), FoldSettings()
 
@@ -257,5 +235,4 @@ class RegistrationSettings:
                 object.__setattr__(self, name, replace(_SHORT_DEFAULTS[name], **{key: value}))
         require_choice(self.start, STARTS, "start")
         require_choice(self.stencil, STENCILS, "stencil")
-        if not 0 <= self.points_weight < math.inf:
-            raise InputError(f"points_weight must be finite and not negative, got {self.points_weight}")
+        require_ranges(self, "", points_weight="finite, not negative")

@@ -20,7 +20,7 @@ from torchdeform.core.warp import compose, invert, sample
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity
 from torchdeform.metrics.similarity import features, make_similarity
-from torchdeform.registration.landmarks import MidspaceLandmarks
+from torchdeform.registration.landmarks import MidspaceLandmarks, of_other_map
 from torchdeform.registration.optimise import Coupling, Objective, SimilarityTerm, optimise_levels
 from torchdeform.registration.problem import PlacedImage, RegistrationProblem, resample_pair
 from torchdeform.registration.result import Callback, LevelRecord
@@ -105,20 +105,18 @@ def symmetric_objective(problem: RegistrationProblem, grid: Grid, settings: Regi
         ones = torch.ones_like(problem.fixed[:, :1])
         masks = torch.cat([ones if mask is None else mask for mask in (problem.fixed_mask, problem.moving_mask)])
     term = SimilarityTerm(problem.grid, images, _MutualSimilarity(settings.similarity, problem.grid), masks)
-    landmarks = None
-    if settings.points_weight > 0 and problem.fixed_points is not None and problem.moving_points is not None:
-        landmarks = MidspaceLandmarks(problem.fixed_points, problem.moving_points, grid)
-    return Objective(term, landmarks, _Opposed())
+    pairs = problem.pairs if settings.points_weight > 0 else None
+    return Objective(term, pairs and MidspaceLandmarks(*pairs, grid), _Opposed())
 
 
 class _Opposed(Coupling):
     """The two maps of a pair, half a batch apart, move against each other."""
 
     def velocity(self, v: Tensor) -> Tensor:
-        return v - _of_other_side(v)
+        return v - of_other_map(v)
 
     def all(self, flags: Tensor) -> Tensor:
-        return flags & _of_other_side(flags)
+        return flags & of_other_map(flags)
 
 
 class _MutualSimilarity(Similarity):
@@ -133,14 +131,10 @@ class _MutualSimilarity(Similarity):
         self.settings, self.grid = settings, grid
 
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        others = _of_other_side(warped)
+        others = of_other_map(warped)
         similarity = make_similarity(self.settings.measure, others, self.settings.window, grid=self.grid)
-        value, slope = similarity.evaluate(warped, None if mask is None else mask * _of_other_side(mask))
-        return (value + _of_other_side(value)) / 2, slope
-
-
-def _of_other_side(both: Tensor) -> Tensor:
-    return both.roll(len(both) // 2, 0)
+        value, slope = similarity.evaluate(warped, None if mask is None else mask * of_other_map(mask))
+        return (value + of_other_map(value)) / 2, slope
 
 
 def _start_in(space: MidSpace, u: Tensor, grid: Grid) -> Tensor:

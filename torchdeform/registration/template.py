@@ -15,7 +15,7 @@ from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Transform, place_of
 from torchdeform.core.warp import compose, invert, max_voxels
 from torchdeform.deformation.averages import average_maps
-from torchdeform.errors import ComputationError, InputError, require_choice
+from torchdeform.errors import RANGES, ComputationError, InputError, require_choice, require_ranges
 from torchdeform.registration.deformable import register
 from torchdeform.registration.result import Callback
 from torchdeform.registration.settings import RegistrationSettings
@@ -72,10 +72,8 @@ class AveragingSettings:
 
     def __post_init__(self) -> None:
         require_choice(self.pose, get_args(Pose), "pose")
-        if self.corrections < 1:
-            raise InputError(f"corrections must be at least 1, got {self.corrections}")
-        if not self.tolerance >= 0:
-            raise InputError(f"tolerance must be a number of voxels, not negative, got {self.tolerance}")
+        voxels = (RANGES["not negative"][0], "be a number of voxels, not negative")
+        require_ranges(self, "", corrections="at least 1", tolerance=voxels)
 
 
 _DEFAULT = AveragingSettings()
@@ -244,8 +242,8 @@ def average_shape(maps: Sequence[Transform], reference: Image, settings: Averagi
         both. Affine parts A_i = Q_i S_i are averaged apart: the symmetric S_i by their logarithms, the rotations Q_i by
         the one nearest to their sum, positions by those of the middle of the grid.
     """
-    for index, map_ in enumerate(maps):
-        _require_kind(map_, reference, index)
+    for index in range(len(maps)):
+        _displacement(maps, reference, index)
     grid = reference.grid
     total = reference.data.new_zeros(1, grid.dim, *grid.shape)
     back, bias = total, []
@@ -259,24 +257,19 @@ def average_shape(maps: Sequence[Transform], reference: Image, settings: Averagi
     return MeanShape(place_of(reference), total, back, _mean_affine(maps, reference, settings.pose), tuple(bias))
 
 
-def _require_kind(map_: Transform, reference: Image, index: int) -> None:
-    first, *rest = map_.stages
-    fits = isinstance(first, Displacement) and first.field.grid.shape == reference.grid.shape
-    if not fits or not all(isinstance(stage, Affine) for stage in rest):
+def _displacement(maps: Sequence[Transform], reference: Image, index: int) -> Tensor:
+    """Return u of one map A ∘ (id + u)."""
+    first, *rest = maps[index].stages
+    known = all(isinstance(stage, Affine) for stage in rest)
+    if not known or not isinstance(first, Displacement) or first.field.grid.shape != reference.grid.shape:
         raise InputError(f"map {index} must be a displacement on the reference's grid, followed by affine maps or none")
-
-
-def _displacement(map_: Transform) -> Tensor:
-    first = map_.stages[0]
-    if not isinstance(first, Displacement):
-        raise InputError("a map from the reference begins with a displacement")
     return first.field.data
 
 
 def _mean_displacement(maps: Sequence[Transform], back: Tensor, reference: Image) -> Tensor:
     """Return the mean of the (id + u_i) ∘ (id + back)."""
     grid = reference.grid
-    fields = Lazy(len(maps), lambda i: compose(_displacement(maps[i]).to(back), back, grid))
+    fields = Lazy(len(maps), lambda i: compose(_displacement(maps, reference, i).to(back), back, grid))
     return average_maps(fields, grid, least=_LEAST_DETERMINANT).value
 
 
@@ -310,14 +303,10 @@ def _mean_affine(maps: Sequence[Transform], reference: Image, pose: Pose) -> Aff
     middle = reference.to_world(half)
     goal = middle
     if pose == "mean":
-        matrix = _nearest_rotation((left @ right).sum(0)) @ matrix
+        left, _, right = torch.linalg.svd((left @ right).sum(0))  # left @ right is the rotation nearest to the sum
+        matrix = left @ right @ matrix
         goal = torch.stack([a(middle) for a in affines]).mean(0)
     return Affine(matrix, (goal[0] - matrix @ middle[0]).squeeze(1))
-
-
-def _nearest_rotation(matrix: Tensor) -> Tensor:
-    left, _, right = torch.linalg.svd(matrix)
-    return left @ right
 
 
 @torch.no_grad()

@@ -1,6 +1,5 @@
 """From a force to a velocity: the least-squares metric of a level, and how far its flow goes in one step."""
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -109,8 +108,3 @@ def max_norm(field: Tensor) -> Tensor:
 def step_size(settings: OptimiserSettings, step: int, steps: int) -> float:
     """Return the longest move in voxels in this step of so many, from 0."""
     return settings.step_length * (1 - (1 - LAST_STEP) * step / max(steps, 1))
-
-
-def points_scale(weight: float, grid: Grid) -> float:
-    """Return what the load of landmarks is multiplied by to be in the unit of N ∂S/∂warped."""
-    return weight * math.prod(grid.shape)

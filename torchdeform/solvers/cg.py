@@ -3,13 +3,15 @@
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import Function
 
+from torchdeform.core.grid import per_item
 from torchdeform.errors import ComputationError, InputError
-from torchdeform.solvers.base import Factor, LinearSolver, Solution, Status, System
+from torchdeform.solvers.base import Factor, Solution, Status, System
 
 # ‖r‖ ≤ rtol ‖b‖ is asked for when nothing else is said.
 DEFAULT_RTOL = {torch.float32: 1e-5, torch.float64: 1e-10}
@@ -82,14 +84,15 @@ class ConjugateGradient:
     Args:
         assembled: multiply by the sparse matrix, made once from ``torch.sparse_coo_tensor`` into compressed rows;
             otherwise the operator is applied without one.
-        preconditioner: a solver whose answer is nearly the inverse; none when None.
+        preconditioner: ``(system, like) -> (r -> z)``, what is nearly the inverse of a system for loads with the type
+            and device of ``like``, as `jacobi`; none when None.
         rtol: relative tolerance, by default `DEFAULT_RTOL` of the dtype.
         atol: absolute tolerance.
         max_steps: steps at most for each item.
     """
 
     assembled: bool = False
-    preconditioner: LinearSolver | None = None
+    preconditioner: Callable[[Any, Tensor], Callable[[Tensor], Tensor]] | None = None
     rtol: float | None = None
     atol: float = 0.0
     max_steps: int = 1000
@@ -103,7 +106,7 @@ class ConjugateGradient:
         precondition = None
         if self.preconditioner is not None:
             with torch.no_grad():
-                precondition = self.preconditioner.init(system, like)
+                precondition = self.preconditioner(system, like)
         product = _matrix_product(system, like) if self.assembled else system.apply
         return ConjugateGradientFactor(self, system, product, precondition)
 
@@ -135,7 +138,11 @@ class ConjugateGradientFactor(Factor):
     """`ConjugateGradient` made ready for one system."""
 
     def __init__(
-        self, solver: ConjugateGradient, system: System, product: Callable[..., Tensor], precondition: Factor | None
+        self,
+        solver: ConjugateGradient,
+        system: System,
+        product: Callable[..., Tensor],
+        precondition: Callable[[Tensor], Tensor] | None,
     ) -> None:
         self.solver, self.system, self.product, self.precondition = solver, system, product, precondition
 
@@ -165,26 +172,10 @@ class ConjugateGradientFactor(Factor):
         return load
 
 
-class Jacobi:
-    """The inverse of the diagonal, as a preconditioner."""
-
-    def init(self, system: System, like: Tensor) -> "JacobiFactor":
-        """Return the inverse diagonal of a system."""
-        return JacobiFactor(1 / system.diagonal(like))
-
-
-class JacobiFactor(Factor):
-    """`Jacobi` made ready for one system."""
-
-    def __init__(self, inverse: Tensor) -> None:
-        self.inverse = inverse
-
-    def __call__(self, load: Tensor, *, power: int = 1) -> Tensor:
-        """Return load / diagonal; power is 1."""
-        return load * self.inverse
-
-    def solution(self, load: Tensor) -> Solution:
-        raise InputError("Jacobi is a preconditioner; it solves nothing by itself")
+def jacobi(system: System, like: Tensor) -> Callable[[Tensor], Tensor]:
+    """Return the preconditioner that divides by the diagonal of a system."""
+    inverse = 1 / system.diagonal(like)
+    return lambda r: r * inverse
 
 
 @dataclass(frozen=True)
@@ -274,7 +265,7 @@ def _solve(operator: Operator, b: Tensor, x0: Tensor | None, settings: _Settings
     code = torch.where(finite, code, _NON_FINITE)
     lost = code == _NON_FINITE
     residual = torch.where(lost, torch.nan, torch.where(norm > 0, left / norm, 0))
-    value = torch.where(_wide(lost, x), torch.nan, x * scale)
+    value = torch.where(per_item(lost, x), torch.nan, x * scale)
     return Solution(value, tuple(_STATUS[c] for c in code.tolist()), steps, residual)
 
 
@@ -296,10 +287,12 @@ def _scaled(b: Tensor, x0: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tenso
     finite = torch.isfinite(b).flatten(1).all(1)
     if x0 is not None:
         finite &= torch.isfinite(x0).flatten(1).all(1)
-    b = torch.where(_wide(finite, b), b, 0)
+    b = torch.where(per_item(finite, b), b, 0)
     largest = b.abs().flatten(1).amax(1)
-    scale = _wide(torch.ldexp(torch.ones_like(largest), torch.frexp(largest).exponent), b)
-    start = torch.zeros_like(b) if x0 is None else torch.where(_wide(finite & (largest > 0), b), x0.detach(), 0) / scale
+    scale = per_item(torch.ldexp(torch.ones_like(largest), torch.frexp(largest).exponent), b)
+    start = (
+        torch.zeros_like(b) if x0 is None else torch.where(per_item(finite & (largest > 0), b), x0.detach(), 0) / scale
+    )
     return b / scale, start, finite, scale
 
 
@@ -318,14 +311,14 @@ def _descend(
     while True in (alive := running.tolist()):
         z = r if settings.preconditioner is None else settings.preconditioner(r)
         before, rz = rz, dots(r, z)
-        p.mul_(_wide(rz / before, p)).add_(z)
+        p.mul_(per_item(rz / before, p)).add_(z)
         for item, runs in enumerate(alive):
             if not runs:
                 p[item].zero_()
         q = operator(p)
         curvature = dots(p, q)
         positive = running & (curvature > 0) & (rz > 0)
-        alpha = _wide(torch.where(positive, rz / curvature, 0), p)
+        alpha = per_item(torch.where(positive, rz / curvature, 0), p)
         x.addcmul_(p, alpha)
         r.addcmul_(q, alpha, value=-1)
         left = _norms(r)
@@ -344,7 +337,3 @@ def dots(a: Tensor, b: Tensor) -> Tensor:
 
 def _norms(a: Tensor) -> Tensor:
     return dots(a, a).sqrt()
-
-
-def _wide(per_item: Tensor, like: Tensor) -> Tensor:
-    return per_item.view(-1, *[1] * (like.dim() - 1))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image, luminance, require_registrable, resample
+from torchdeform.core.image import Image, luminance, require_registrable, require_same_dimension, resample
 from torchdeform.core.intensities import fill, to_common_scale
 from torchdeform.core.resampling import with_spacing
 from torchdeform.core.transform import Affine
@@ -177,9 +177,7 @@ def _prepared(
     fixed: tuple[Image, Image | None], moving: tuple[Image, Image | None], settings: AlignmentSettings
 ) -> tuple[MaskedImage, MaskedImage]:
     """Return both images grey, cropped to their masks, with most of their intensities between 0 and 1."""
-    if fixed[0].grid.dim != moving[0].grid.dim:
-        kinds = f"{fixed[0].name} is {fixed[0].grid.dim}D but {moving[0].name} is {moving[0].grid.dim}D"
-        raise InputError(f"{kinds}; give two images of the same dimension")
+    require_same_dimension(fixed[0], moving[0])
     pair = [_masked(luminance(image), mask).cropped(_MARGIN) for image, mask in (fixed, moving)]
     scaled = to_common_scale(
         (pair[0].image.data, pair[1].image.data),

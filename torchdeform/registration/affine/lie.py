@@ -71,7 +71,7 @@ def rotations(dim: int) -> Tensor:
     Returns:
         ``(36, 2, 2)``, or in 3D the ``(60, 3, 3)`` rotations of the icosahedron, float64.
     """
-    return _ROTATIONS[dim]()
+    return _circle() if dim == 2 else _icosahedron()
 
 
 def _circle() -> Tensor:
@@ -91,9 +91,6 @@ def _icosahedron() -> Tensor:
             if (found - new).abs().amax((1, 2)).min() > 1e-6:
                 found = torch.cat([found, new.unsqueeze(0)])
     return found
-
-
-_ROTATIONS = {2: _circle, 3: _icosahedron}
 
 
 def angle(linear: Tensor) -> Tensor:

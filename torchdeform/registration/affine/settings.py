@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from torchdeform.errors import InputError, require_choice
+from torchdeform.errors import require_choice, require_ranges
 from torchdeform.metrics.similarity import similarity_weights
 
 ALIGNMENTS = ("none", "translation", "rigid", "similarity", "affine")
@@ -51,14 +51,9 @@ class AlignmentSettings:
         similarity_weights(self.similarity)
         if not isinstance(self.similarity, str):  # a copy of our own, and a dict, which `asdict` can take
             object.__setattr__(self, "similarity", dict(self.similarity))
-        if self.window is not None and (self.window < 3 or self.window % 2 == 0):
-            raise InputError(f"align.window must be an odd number of voxels, at least 3, got {self.window}")
-        if not 0 < self.min_overlap <= 1:
-            raise InputError(f"align.min_overlap must lie between 0 and 1, got {self.min_overlap}")
-        if self.nodes is not None and self.nodes < COARSEST_NODES:
-            raise InputError(f"align.nodes must be at least {COARSEST_NODES}, got {self.nodes}")
-        if self.steps < 1:
-            raise InputError(f"align.steps must be at least 1, got {self.steps}")
+        enough = (lambda nodes: nodes >= COARSEST_NODES, f"be at least {COARSEST_NODES}")
+        share = (lambda overlap: 0 < overlap <= 1, "be above 0, and 1 at most")
+        require_ranges(self, "align.", window="window", min_overlap=share, nodes=enough, steps="at least 1")
 
     def window_in(self, dim: int) -> int:
         """Return the width of the window for images of ``dim`` axes."""
