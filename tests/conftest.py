@@ -15,7 +15,7 @@ from torchdeform.core.diagnostics import diagnose
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, resample
 from torchdeform.core.warp import invert
-from torchdeform.registration.problem import Guidance
+from torchdeform.registration.problem import Annotations
 from torchdeform.registration.result import Callback, LevelRecord, Progress, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
 
@@ -107,11 +107,11 @@ def known_result(
     moving: Image,
     config: RegistrationSettings | None = None,
     *,
-    guidance: Guidance | None = None,
+    annotations: Annotations | None = None,
     callback: Callback | None = None,
 ) -> RegistrationResult:
     """Answer like `torchdeform.register`, at once: the map is `smooth_displacement`, whatever the images."""
-    del guidance
+    del annotations
     grid = fixed.grid
     u = smooth_displacement(grid)
     inverse = invert(u, grid)

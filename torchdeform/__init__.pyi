@@ -47,7 +47,7 @@ from .registration.affine.align import Alignment, align
 from .registration.affine.settings import AlignmentSettings
 from .registration.deformable import register
 from .registration.discrete import discrete_start
-from .registration.problem import Guidance
+from .registration.problem import Annotations
 from .registration.result import RegistrationResult
 from .registration.settings import (
     DiscreteSettings,
@@ -62,6 +62,7 @@ __all__ = [
     "Affine",
     "Alignment",
     "AlignmentSettings",
+    "Annotations",
     "AveragingSettings",
     "ComputationError",
     "DeformationSettings",
@@ -70,7 +71,6 @@ __all__ = [
     "Displacement",
     "Evaluation",
     "Grid",
-    "Guidance",
     "Image",
     "InputError",
     "Measures",

@@ -127,9 +127,9 @@ def _torchdeform(preset: str) -> Tool:
 
         fixed, moving = (td.read_image(name) for name in job.names)
         masks = [None, None] if job.masks is None else [td.read_image(name).to(job.device) for name in job.masks]
-        guidance = td.Guidance(fixed_mask=masks[0], moving_mask=masks[1])
+        annotations = td.Annotations(fixed_mask=masks[0], moving_mask=masks[1])
         settings = td.load_settings(preset)
-        result = td.register(fixed.to(job.device), moving.to(job.device), settings, guidance=guidance)
+        result = td.register(fixed.to(job.device), moving.to(job.device), settings, annotations=annotations)
         transform = td.Transform.from_displacement(
             result.displacement.cpu(), fixed, affine=result.affine, moving=moving
         )

@@ -23,7 +23,7 @@ from torchdeform.metrics.evaluation import (
     hausdorff,
     landmark_distances,
 )
-from torchdeform.registration.problem import Guidance
+from torchdeform.registration.problem import Annotations
 
 
 def surface_by_counting(region: Tensor) -> list[tuple[int, ...]]:
@@ -99,13 +99,13 @@ def test_the_right_map_fits_labels_and_landmarks():
     truth = bend(grid, 3.0)
     moving = stripes(shape)
     points = torch.rand(1, 2, 6, generator=torch.Generator().manual_seed(0)) * 30 + 2
-    guidance = Guidance(
+    annotations = Annotations(
         fixed_labels=warp(moving, truth, grid, mode="nearest"),
         moving_labels=moving,
         fixed_points=points,
         moving_points=points + sample(truth, points, grid),
     )
-    found = evaluate_tensors(truth, grid, labels=guidance.labels, points=guidance.points)
+    found = evaluate_tensors(truth, grid, labels=annotations.labels, points=annotations.points)
     assert found is not None
     assert found.aligned is None
     assert found.before.labels == found.after.labels == (1, 2, 3, 4, 5, 6)
@@ -130,13 +130,13 @@ def test_images_are_measured_in_their_place_before_and_after_each_map():
     points = fixed.to_world(torch.rand(1, 2, 5, generator=torch.Generator().manual_seed(0)).double() * 30)
     place = fixed.to_grid(points)
     ends = affine(fixed.to_world(place + sample(u.double(), place, fixed.grid)))
-    guidance = Guidance(
+    annotations = Annotations(
         fixed_labels=Image(labels, fixed.grid, fixed.origin),
         moving_labels=moving,
         fixed_points=points,
         moving_points=ends,
     )
-    found = evaluate_images(fixed, affine, u, labels=guidance.labels, points=guidance.points)
+    found = evaluate_images(fixed, affine, u, labels=annotations.labels, points=annotations.points)
     assert found is not None
     assert found.aligned is not None
     assert (found.after.dice > 0.97).all()

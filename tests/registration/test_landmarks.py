@@ -10,7 +10,7 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.warp import sample, warp
 from torchdeform.registration.deformable import register
 from torchdeform.registration.landmarks import scatter_points
-from torchdeform.registration.problem import Guidance
+from torchdeform.registration.problem import Annotations
 
 QUICK = settings_of(steps=(30, 20, 10), weight_div=1.0, length_scale=6.0, window=7, align="none")
 
@@ -28,9 +28,9 @@ def test_landmarks_with_a_high_weight_meet_although_the_images_say_otherwise(sha
     grid, moving = Grid(shape), blobs(shape, 1)
     truth = bend(grid, 3.0)
     points, ends = landmarks(truth, grid)
-    guidance = Guidance(fixed_points=points, moving_points=ends + 1.5)
+    annotations = Annotations(fixed_points=points, moving_points=ends + 1.5)
     settings = settings_of(points_weight=30.0, symmetric=symmetric)
-    result = register(warp(moving, truth, grid), moving, settings, guidance=guidance)
+    result = register(warp(moving, truth, grid), moving, settings, annotations=annotations)
     assert result.evaluation is not None
     assert result.evaluation.before.distances.mean() > 1.5
     assert result.evaluation.after.distances.max() < 0.2
@@ -46,8 +46,8 @@ def test_landmarks_and_images_are_combined():
     climb = changed(QUICK, tolerance=0.0)  # all steps, so that the ends can be compared
     after, similar = [], []
     for weight in (0.0, 0.001, 1.0):
-        guidance = Guidance(fixed_points=points, moving_points=ends + 1.5)
-        result = register(fixed, moving, changed(climb, points_weight=weight), guidance=guidance)
+        annotations = Annotations(fixed_points=points, moving_points=ends + 1.5)
+        result = register(fixed, moving, changed(climb, points_weight=weight), annotations=annotations)
         after.append(result.evaluation.after.distances.mean().item())
         similar.append(result.similarity_after.item())
     assert after[0] > after[1] > after[2]
@@ -61,9 +61,9 @@ def test_landmarks_and_images_are_combined():
 def test_landmarks_that_contradict_each_other_do_not_make_it_fold(shape, symmetric):
     grid, moving = Grid(shape), blobs(shape, 1)
     points, _ = landmarks(torch.zeros(1, grid.dim, *shape), grid)
-    guidance = Guidance(fixed_points=points, moving_points=points.flip(2))
+    annotations = Annotations(fixed_points=points, moving_points=points.flip(2))
     settings = changed(QUICK, points_weight=100.0, symmetric=symmetric)
-    result = register(moving.flip(2), moving, settings, guidance=guidance)
+    result = register(moving.flip(2), moving, settings, annotations=annotations)
     assert result.diagnosis.folds.item() == 0
     nearer = result.evaluation.after.distances.mean() < result.evaluation.before.distances.mean()
     assert nearer or symmetric  # two maps bring the ends of a pair together in the middle, which says less

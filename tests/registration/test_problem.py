@@ -1,4 +1,4 @@
-"""Guidance: masks hide, landmarks pull, channels add up, a start is gone on from; what does not fit is named."""
+"""Annotations: masks hide, landmarks pull, channels add up, a start is gone on from; what does not fit is named."""
 
 import math
 from dataclasses import replace
@@ -15,7 +15,7 @@ from torchdeform.core.transform import Affine
 from torchdeform.core.warp import sample, warp
 from torchdeform.errors import InputError
 from torchdeform.registration.deformable import register
-from torchdeform.registration.problem import Guidance, moved
+from torchdeform.registration.problem import Annotations, moved
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
@@ -29,11 +29,14 @@ def test_garbage_outside_the_masks_does_not_change_anything(similarity, symmetri
     shape = (48, 40)
     settings = changed(QUICK, similarity=similarity, symmetric=symmetric)
     masks = disc(shape, (24, 18), 15), disc(shape, (22, 20), 16)
-    guidance = Guidance(fixed_mask=masks[0], moving_mask=masks[1])
+    annotations = Annotations(fixed_mask=masks[0], moving_mask=masks[1])
     images = blobs(shape, 1), blobs(shape, 2)
     garbage = torch.full(shape, torch.nan), torch.randn(shape) * 1e4
     spoilt = [torch.where(m > 0, i, g) for m, i, g in zip(masks, images, garbage, strict=True)]
-    clean, dirty = register(*images, settings, guidance=guidance), register(*spoilt, settings, guidance=guidance)
+    clean, dirty = (
+        register(*images, settings, annotations=annotations),
+        register(*spoilt, settings, annotations=annotations),
+    )
     assert torch.equal(clean.displacement, dirty.displacement)
     assert torch.equal(clean.similarity_after, dirty.similarity_after)
 
@@ -50,8 +53,8 @@ def test_a_lesion_that_is_masked_out_is_ignored(side):
     else:
         moving = torch.where(lesion > 0, texture, moving)
     errors = []
-    for guidance in (Guidance(), Guidance(**{side: 1 - lesion})):
-        u = register(fixed, moving, QUICK, guidance=guidance).displacement
+    for annotations in (Annotations(), Annotations(**{side: 1 - lesion})):
+        u = register(fixed, moving, QUICK, annotations=annotations).displacement
         errors.append((u - truth).square().sum(1).sqrt()[:, 3:-3, 3:-3].mean().item())
     assert errors[1] < 0.4 * errors[0]
     assert errors[1] < 0.4
@@ -60,10 +63,10 @@ def test_a_lesion_that_is_masked_out_is_ignored(side):
 def test_boolean_masks_and_masks_of_ones_mean_what_they_say():
     shape = (40, 40)
     images, mask = (blobs(shape, 1), blobs(shape, 2)), disc(shape, (20, 20), 14)
-    as_float, as_bool = (register(*images, QUICK, guidance=Guidance(fixed_mask=m)) for m in (mask, mask > 0))
+    as_float, as_bool = (register(*images, QUICK, annotations=Annotations(fixed_mask=m)) for m in (mask, mask > 0))
     assert torch.equal(as_float.displacement, as_bool.displacement)
     plain = register(*images, changed(QUICK, steps=(5,)))
-    ones = register(*images, changed(QUICK, steps=(5,)), guidance=Guidance(fixed_mask=torch.ones(1, 1, *shape)))
+    ones = register(*images, changed(QUICK, steps=(5,)), annotations=Annotations(fixed_mask=torch.ones(1, 1, *shape)))
     torch.testing.assert_close(plain.displacement, ones.displacement, rtol=0, atol=1e-3)
 
 
@@ -106,14 +109,14 @@ def test_a_batch_with_guidance_equals_its_items():
     masks = torch.cat([disc(shape, (20, 20), 15), disc(shape, (24, 30), 12)]).double()
     points = torch.tensor([[[12.0, 25.0], [15.0, 30.0]], [[20.0, 30.0], [22.0, 36.0]]]).double()
     settings = changed(QUICK, points_weight=0.1)
-    whole = Guidance(fixed_mask=masks, fixed_points=points, moving_points=points + 1)
+    whole = Annotations(fixed_mask=masks, fixed_points=points, moving_points=points + 1)
     for symmetric in (False, True):
         settings = changed(settings, symmetric=symmetric)
-        together = register(fixed, moving, settings, guidance=whole)
+        together = register(fixed, moving, settings, annotations=whole)
         for item in range(2):
             part = slice(item, item + 1)
-            own = Guidance(fixed_mask=masks[part], fixed_points=points[part], moving_points=points[part] + 1)
-            alone = register(fixed[part], moving[part], settings, guidance=own)
+            own = Annotations(fixed_mask=masks[part], fixed_points=points[part], moving_points=points[part] + 1)
+            alone = register(fixed[part], moving[part], settings, annotations=own)
             torch.testing.assert_close(together.displacement[part], alone.displacement, rtol=0, atol=2e-3)
             torch.testing.assert_close(
                 together.evaluation.after.distances[part], alone.evaluation.after.distances, rtol=0, atol=2e-3
@@ -147,8 +150,8 @@ def world_landmarks(wide: Image, truth: Tensor, affine: Affine) -> tuple[Tensor,
 def test_an_affine_map_comes_after_the_displacement(symmetric):
     fixed, moving, affine, wide, truth = oblique_pair()
     points, ends = world_landmarks(wide, truth, affine)
-    guidance = Guidance(fixed_points=points, moving_points=ends)
-    result = register(fixed, moving, changed(QUICK, symmetric=symmetric), guidance=guidance, affine=affine)
+    annotations = Annotations(fixed_points=points, moving_points=ends)
+    result = register(fixed, moving, changed(QUICK, symmetric=symmetric), annotations=annotations, affine=affine)
     found = result.evaluation
     assert found.before.distances.mean() > found.aligned.distances.mean() > 1
     assert found.after.distances.mean() < 0.3
@@ -170,8 +173,8 @@ def test_masks_of_images_may_lie_on_grids_of_their_own():
     garbage = Image(1e4 * torch.randn(fixed.data.shape), fixed.grid, fixed.origin, fixed.direction)
     inside = resample(masks[0], fixed, mode="nearest") > 0
     spoilt = replace(fixed, data=torch.where(inside, fixed.data, garbage.data))
-    guidance = Guidance(fixed_mask=masks[0], moving_mask=masks[1], fixed_points=points, moving_points=ends)
-    result = register(spoilt, moving, QUICK, guidance=guidance, affine=affine)
+    annotations = Annotations(fixed_mask=masks[0], moving_mask=masks[1], fixed_points=points, moving_points=ends)
+    result = register(spoilt, moving, QUICK, annotations=annotations, affine=affine)
     assert result.evaluation.after.distances.mean() < 0.5 * result.evaluation.aligned.distances.mean()
 
 
@@ -181,11 +184,11 @@ def test_everything_together_on_every_device(symmetric, device):
     fixed, moving, affine, wide, truth = oblique_pair()
     points, ends = world_landmarks(wide, truth, affine)
     ones = [replace(i, data=torch.ones_like(i.data)) for i in (fixed, moving)]
-    guidance = Guidance(fixed_points=points, moving_points=ends, fixed_mask=ones[0], moving_mask=ones[1])
+    annotations = Annotations(fixed_points=points, moving_points=ends, fixed_mask=ones[0], moving_mask=ones[1])
     settings = changed(QUICK, symmetric=symmetric, points_weight=0.1)
     start = torch.zeros(1, 2, *fixed.grid.shape).to(device)
     pair = fixed.to(device), moving.to(device)
-    result = register(*pair, settings, guidance=guidance.to(device), affine=affine, start=start)
+    result = register(*pair, settings, annotations=annotations.to(device), affine=affine, start=start)
     assert result.warped.device.type == device
     assert result.evaluation.after.distances.mean() < 0.2
     assert result.diagnosis.folds.item() == 0
@@ -202,7 +205,7 @@ POINTS = torch.rand(1, 2, 3)
 
 
 @pytest.mark.parametrize(
-    ("guidance", "message"),
+    ("annotations", "message"),
     [
         ({"fixed_mask": torch.zeros(1, 1, 16, 16)}, "fixed_mask is 0 everywhere"),
         ({"moving_mask": torch.full((1, 1, 16, 16), 255.0)}, "moving_mask must hold weights from 0 to 1"),
@@ -218,13 +221,13 @@ POINTS = torch.rand(1, 2, 3)
         ({"fixed_labels": torch.ones(1, 1, 16, 16), "moving_labels": torch.zeros(1, 1, 16, 16)}, "no label in common"),
     ],
 )
-def test_guidance_that_does_not_fit_is_named(guidance, message):
+def test_guidance_that_does_not_fit_is_named(annotations, message):
     with pytest.raises(InputError, match=message):
-        register(*PAIR, changed(QUICK, steps=(1,)), guidance=Guidance(**guidance))
+        register(*PAIR, changed(QUICK, steps=(1,)), annotations=Annotations(**annotations))
 
 
 @pytest.mark.parametrize(
-    ("guidance", "message"),
+    ("annotations", "message"),
     [
         ({"fixed_mask": torch.ones(1, 1, 16, 16)}, "fixed_mask must be an Image"),
         ({"fixed_mask": image(torch.ones(1, 1, 8, 8, 8), "volume")}, "volume must be 2D"),
@@ -233,9 +236,9 @@ def test_guidance_that_does_not_fit_is_named(guidance, message):
         ({"fixed_points": POINTS.repeat(2, 1, 1), "moving_points": POINTS.repeat(2, 1, 1)}, "must have shape"),
     ],
 )
-def test_guidance_that_does_not_fit_images_is_named(guidance, message):
+def test_guidance_that_does_not_fit_images_is_named(annotations, message):
     with pytest.raises(InputError, match=message):
-        register(*map(image, PAIR), changed(QUICK, steps=(1,), align="none"), guidance=Guidance(**guidance))
+        register(*map(image, PAIR), changed(QUICK, steps=(1,), align="none"), annotations=Annotations(**annotations))
 
 
 def test_starts_and_affine_maps_that_do_not_fit_are_named():

@@ -14,7 +14,7 @@ from torchdeform.core.transform import Affine, Transform
 from torchdeform.core.warp import compose, max_voxels, voxels, warp
 from torchdeform.errors import InputError
 from torchdeform.registration.deformable import register
-from torchdeform.registration.problem import Guidance, moved
+from torchdeform.registration.problem import Annotations, moved
 from torchdeform.registration.symmetric import common_axes, midspace_frame, root
 
 SYMMETRIC = settings_of(steps=(30, 20, 10), step_length=0.5, length_scale=6.0, window=7, symmetric=True, align="none")
@@ -59,13 +59,13 @@ def test_swapping_with_masks_and_landmarks_inverts_the_map():
         fixed,
         moving,
         settings,
-        guidance=Guidance(fixed_mask=masks[0], moving_mask=masks[1], fixed_points=points, moving_points=ends),
+        annotations=Annotations(fixed_mask=masks[0], moving_mask=masks[1], fixed_points=points, moving_points=ends),
     )
     back = register(
         moving,
         fixed,
         settings,
-        guidance=Guidance(fixed_mask=masks[1], moving_mask=masks[0], fixed_points=ends, moving_points=points),
+        annotations=Annotations(fixed_mask=masks[1], moving_mask=masks[0], fixed_points=ends, moving_points=points),
     )
     assert voxels(there.inverse - back.displacement, grid).mean() < 0.02
     assert voxels(there.inverse - back.displacement, grid).max() < 0.2

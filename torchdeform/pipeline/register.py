@@ -21,7 +21,7 @@ from torchdeform.metrics.evaluation import common_labels
 from torchdeform.pipeline.memory import available, fitting_grid, footprint, peak, readable
 from torchdeform.pipeline.preflight import WARNING, preflight
 from torchdeform.registration.deformable import resample_result
-from torchdeform.registration.problem import Guidance
+from torchdeform.registration.problem import Annotations
 from torchdeform.registration.result import Callback, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.figures import write_overview
@@ -79,7 +79,7 @@ class Inputs:
 
     fixed: Image
     moving: Image
-    guidance: Guidance
+    annotations: Annotations
     warnings: tuple[str, ...] = ()
 
 
@@ -135,22 +135,22 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
     )
     report.require_ok()
     labels = [None if path is None else read_labels(path) for path in (files.fixed_labels, files.moving_labels)]
-    guidance = Guidance(
+    annotations = Annotations(
         fixed_mask=masks[0],
         moving_mask=masks[1],
         fixed_labels=labels[0],
         moving_labels=labels[1],
         **_read_points(files, fixed, moving),
     )
-    guidance.require_images(fixed.grid.dim)
+    annotations.require_images(fixed.grid.dim)
     if labels[0] is not None and labels[1] is not None:  # some must be the same, or nothing can be measured
         first = resample(labels[0], fixed, mode="nearest")
         common_labels(first, labels[1].data, names=(labels[0].name, labels[1].name))
-    return Inputs(fixed, moving, guidance, report.of(WARNING))
+    return Inputs(fixed, moving, annotations, report.of(WARNING))
 
 
 def _read_points(files: PairFiles, fixed: Image, moving: Image) -> dict[str, Tensor]:
-    """Return corresponding landmarks in the world, ``(1, D, n)`` each, by the names that `Guidance` has for them."""
+    """Return corresponding landmarks in the world, ``(1, D, n)`` each, by the names that `Annotations` has for them."""
     if files.fixed_points is None or files.moving_points is None:
         return {}
     first, second, _ = matched(read_points(files.fixed_points, fixed), read_points(files.moving_points, moving))
@@ -187,10 +187,10 @@ def register_files(
     inputs = read_inputs(files, settings, memory)
     fixed, notes = _fit_to_memory(inputs.fixed, settings, memory, where)
     run = _Run(memory, {"read": perf_counter() - start}, {"read": peak()})
-    moving, guidance = inputs.moving.to(where), inputs.guidance.to(where)
-    result = register(fixed.to(where), moving, settings, guidance=guidance, callback=callback)
+    moving, annotations = inputs.moving.to(where), inputs.annotations.to(where)
+    result = register(fixed.to(where), moving, settings, annotations=annotations, callback=callback)
     if fixed is not inputs.fixed:  # a coarser grid was registered
-        result = resample_result(result, inputs.fixed.to(where), moving, guidance)
+        result = resample_result(result, inputs.fixed.to(where), moving, annotations)
     _require_finite(result)
     run.peaks[next(reversed(result.seconds), "register")] = peak()
     found = result.alignment.warnings if result.alignment else ()
@@ -276,8 +276,8 @@ def _write_images(folder: Path, files: PairFiles, inputs: Inputs, result: Regist
     write_displacement(transform.flatten(fixed).field.data, fixed, folder / "displacement.nii.gz")
     write_transform(transform, folder / "transform.h5")
     write_transform(transform.inverse(), folder / "inverse.h5")
-    if files.moving_labels is not None and isinstance(inputs.guidance.moving_labels, Image):
-        labels = transform.labels(inputs.guidance.moving_labels, fixed)
+    if files.moving_labels is not None and isinstance(inputs.annotations.moving_labels, Image):
+        labels = transform.labels(inputs.annotations.moving_labels, fixed)
         write_labels(labels, folder / f"warped_labels{ending_like(files.moving_labels, labels)}")
 
 

@@ -20,7 +20,7 @@ from torchdeform.registration.affine.align import Alignment, align
 from torchdeform.registration.discrete import discrete_start
 from torchdeform.registration.optimise import forward_similarity, optimise_levels
 from torchdeform.registration.problem import (
-    Guidance,
+    Annotations,
     PlacedImage,
     RegistrationProblem,
     moved,
@@ -45,7 +45,7 @@ def register(
     moving: Tensor | Image,
     config: RegistrationSettings | None = None,
     *,
-    guidance: Guidance | None = None,
+    annotations: Annotations | None = None,
     affine: Affine | None = None,
     start: Tensor | None = None,
     callback: Callback | None = None,
@@ -56,7 +56,7 @@ def register(
         fixed: image that stays: ``(B, C, *S)`` with a pair per item, or an `Image`.
         moving: image that is warped; a tensor of the same shape, or an `Image` anywhere in the same world.
         config: settings; those of the preset ``default`` when None.
-        guidance: masks, landmarks and labels.
+        annotations: masks, landmarks and labels.
         affine: map A from the world of the fixed image to that of the moving one, for images; when None, that which
             `align` finds as ``config.align`` says.
         start: displacement ``(B, D, *S)`` in units of spacing to begin with, fold-free; what the coarsest level cannot
@@ -69,7 +69,7 @@ def register(
 
     Raises:
         InputError: shapes, fewer than 8 nodes on an axis, NaN or constant images, 2D against 3D, channels that do not
-            correspond, a start that folds, guidance that does not fit.
+            correspond, a start that folds, annotations that does not fit.
         ComputationError: the map is not finite.
 
     Notes:
@@ -80,26 +80,26 @@ def register(
         controls driven by the images. Landmarks add the force of their squared distance at the points. With
         ``symmetric`` two maps from a space between move against each other, and φ = φ_m ∘ φ_f⁻¹.
     """
-    settings, guidance = config or RegistrationSettings(), guidance or Guidance()
+    settings, annotations = config or RegistrationSettings(), annotations or Annotations()
     if isinstance(fixed, Image) and isinstance(moving, Image):
-        return _register_images(fixed, moving, settings, guidance, affine, start, callback)
+        return _register_images(fixed, moving, settings, annotations, affine, start, callback)
     if isinstance(fixed, Image) or isinstance(moving, Image):
         raise InputError("register: fixed and moving must be two tensors or two Images, not one of each")
     if affine is not None:
         raise InputError("register: affine is a map of the world, so fixed and moving must be Images")
-    return _register_tensors(fixed, moving, settings, guidance, start, callback)
+    return _register_tensors(fixed, moving, settings, annotations, start, callback)
 
 
 def _register_tensors(
     fixed: Tensor,
     moving: Tensor,
     settings: RegistrationSettings,
-    guidance: Guidance,
+    annotations: Annotations,
     start: Tensor | None,
     callback: Callback | None,
 ) -> RegistrationResult:
-    grid = _checked_grid(fixed, moving, guidance)
-    problem = problem_of_tensors(fixed, moving, grid, guidance)
+    grid = _checked_grid(fixed, moving, annotations)
+    problem = problem_of_tensors(fixed, moving, grid, annotations)
     require_finite(problem.fixed, problem.moving, "register")
     problem = problem.scaled(settings)
     space = midspace_of_tensors(problem) if settings.symmetric else None
@@ -107,11 +107,11 @@ def _register_tensors(
     del problem, space
     with limit_threads(len(found.u), grid):
         warped = warp(moving, found.u, grid)
-        evaluation = evaluate_tensors(found.u, grid, labels=guidance.labels, points=guidance.points)
+        evaluation = evaluate_tensors(found.u, grid, labels=annotations.labels, points=annotations.points)
     return replace(_result(found, grid, warped, settings), evaluation=evaluation)
 
 
-def _checked_grid(fixed: Tensor, moving: Tensor, guidance: Guidance) -> Grid:
+def _checked_grid(fixed: Tensor, moving: Tensor, annotations: Annotations) -> Grid:
     if not isinstance(fixed, Tensor) or fixed.dim() not in (4, 5):
         raise InputError("register: fixed must be a tensor (B, C, *S) with 2 or 3 axes in S, or an Image")
     grid = Grid(tuple(fixed.shape[2:]))
@@ -120,7 +120,7 @@ def _checked_grid(fixed: Tensor, moving: Tensor, guidance: Guidance) -> Grid:
     if fixed.shape[0] != moving.shape[0] or fixed.dtype != moving.dtype or fixed.device != moving.device:
         raise InputError("register: fixed and moving must agree in batch size, dtype and device")
     _require_size(grid)
-    guidance.require_tensors(grid, fixed.shape[0])
+    annotations.require_tensors(grid, fixed.shape[0])
     return grid
 
 
@@ -133,17 +133,17 @@ def _register_images(
     fixed: Image,
     moving: Image,
     settings: RegistrationSettings,
-    guidance: Guidance,
+    annotations: Annotations,
     affine: Affine | None,
     start: Tensor | None,
     callback: Callback | None,
 ) -> RegistrationResult:
     """Take the moving image onto the fixed grid in its physical place, register, and sample the original once."""
     _require_size(fixed.grid)
-    guidance.require_images(fixed.grid.dim)
-    both, alignment = placed_images(fixed, moving, guidance), None
+    annotations.require_images(fixed.grid.dim)
+    both, alignment = placed_images(fixed, moving, annotations), None
     if affine is None and settings.align.kind != "none":
-        alignment = _align(fixed, moving, settings, guidance)
+        alignment = _align(fixed, moving, settings, annotations)
         affine = alignment.affine
     aligned = both[1] if affine is None else both[1].moved(affine.inverse())
     problem = resample_pair(both[0], aligned, fixed).scaled(settings)
@@ -156,14 +156,14 @@ def _register_images(
         result,
         affine=affine,
         alignment=alignment,
-        evaluation=evaluate_images(fixed, affine, found.u, labels=guidance.labels, points=guidance.points),
+        evaluation=evaluate_images(fixed, affine, found.u, labels=annotations.labels, points=annotations.points),
         seconds=({"align": alignment.seconds} if alignment else {}) | result.seconds,
     )
 
 
-def _align(fixed: Image, moving: Image, settings: RegistrationSettings, guidance: Guidance) -> Alignment:
+def _align(fixed: Image, moving: Image, settings: RegistrationSettings, annotations: Annotations) -> Alignment:
     """Align as the settings say, with masks."""
-    masks = (guidance.fixed_mask, guidance.moving_mask)
+    masks = (annotations.fixed_mask, annotations.moving_mask)
     first, second = (mask if isinstance(mask, Image) else None for mask in masks)
     return align(fixed, moving, fixed_mask=first, moving_mask=second, settings=settings.align)
 
@@ -266,14 +266,16 @@ def _require_sound(u: Tensor, grid: Grid) -> Diagnosis:
 
 
 @torch.no_grad()
-def resample_result(result: RegistrationResult, fixed: Image, moving: Image, guidance: Guidance) -> RegistrationResult:
+def resample_result(
+    result: RegistrationResult, fixed: Image, moving: Image, annotations: Annotations
+) -> RegistrationResult:
     """Return the result on the grid of ``fixed``, everything that follows from its maps made anew.
 
     Args:
         result: of images, on a coarser grid of the same box.
         fixed: the fixed image, whose grid is wanted.
         moving: the moving image.
-        guidance: labels and landmarks to measure.
+        annotations: labels and landmarks to measure.
 
     Returns:
         The result with both maps interpolated linearly, and repaired where that folds them; similarities are
@@ -291,5 +293,5 @@ def resample_result(result: RegistrationResult, fixed: Image, moving: Image, gui
         diagnosis=diagnose(u, grid),
         inverse_error_mean=mean,
         inverse_error_max=largest,
-        evaluation=evaluate_images(fixed, result.affine, u, labels=guidance.labels, points=guidance.points),
+        evaluation=evaluate_images(fixed, result.affine, u, labels=annotations.labels, points=annotations.points),
     )

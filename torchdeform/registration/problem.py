@@ -17,7 +17,7 @@ from torchdeform.registration.settings import RegistrationSettings
 
 
 @dataclass(frozen=True, kw_only=True)
-class Guidance:
+class Annotations:
     """Masks, landmarks and labels; for tensors they are tensors, for images masks and labels are `Image`s.
 
     Args:
@@ -50,10 +50,10 @@ class Guidance:
         if self.fixed_points is not None and self.moving_points is not None:
             _require_pairs(self.fixed_points, self.moving_points)
 
-    def to(self, device: torch.device | str) -> "Guidance":
+    def to(self, device: torch.device | str) -> "Annotations":
         """Return the same with everything on ``device``."""
         parts = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Guidance(**{name: None if part is None else part.to(device) for name, part in parts.items()})
+        return Annotations(**{name: None if part is None else part.to(device) for name, part in parts.items()})
 
     @property
     def labels(self) -> tuple[Any, Any] | None:
@@ -137,11 +137,11 @@ class RegistrationProblem:
         return replace(self, fixed=images[0], moving=images[1])
 
 
-def problem_of_tensors(fixed: Tensor, moving: Tensor, grid: Grid, guidance: Guidance) -> RegistrationProblem:
+def problem_of_tensors(fixed: Tensor, moving: Tensor, grid: Grid, annotations: Annotations) -> RegistrationProblem:
     """Return the problem of two tensors on one grid, filled in where the masks are 0."""
-    masks = [_weights(mask, fixed) for mask in (guidance.fixed_mask, guidance.moving_mask)]
+    masks = [_weights(mask, fixed) for mask in (annotations.fixed_mask, annotations.moving_mask)]
     images = [image if mask is None else fill(image, mask) for image, mask in zip((fixed, moving), masks, strict=True)]
-    points = [None if p is None else p.to(fixed) for p in (guidance.fixed_points, guidance.moving_points)]
+    points = [None if p is None else p.to(fixed) for p in (annotations.fixed_points, annotations.moving_points)]
     return RegistrationProblem(grid, *images, *masks, *points)
 
 
@@ -181,15 +181,15 @@ def moved(image: Image, affine: Affine) -> Image:
     )
 
 
-def placed_images(fixed: Image, moving: Image, guidance: Guidance) -> tuple[PlacedImage, PlacedImage]:
+def placed_images(fixed: Image, moving: Image, annotations: Annotations) -> tuple[PlacedImage, PlacedImage]:
     """Return both images as they are compared.
 
     Raises:
         InputError: channels that do not correspond, masks that are empty, pixels that count but are NaN or all equal.
     """
     images = corresponding_channels(fixed, moving)
-    first = _placed(images[0], guidance.fixed_mask, guidance.fixed_points)
-    return first, _placed(images[1], guidance.moving_mask, guidance.moving_points)
+    first = _placed(images[0], annotations.fixed_mask, annotations.fixed_points)
+    return first, _placed(images[1], annotations.moving_mask, annotations.moving_points)
 
 
 def _placed(image: Image, mask: Tensor | Image | None, points: Tensor | None) -> PlacedImage:
