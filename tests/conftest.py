@@ -61,7 +61,7 @@ def root() -> Path:
     return ROOT
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def data_folder() -> Path:
     """The folder of real images that ``TORCHDEFORM_DATA`` names."""
     folder = Path(os.environ.get("TORCHDEFORM_DATA", ROOT.parent / "shared" / "data"))

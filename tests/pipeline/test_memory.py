@@ -59,6 +59,17 @@ def test_two_maps_take_twice_as_much_for_a_voxel_but_no_second_process():
     assert need(large, similarity="ssd", start="discrete") < need(large, similarity="ssd", symmetric=True)
 
 
+def test_an_assembled_matrix_takes_its_part_up_to_the_largest():
+    """243 entries a node in 3D and 36 in 2D, each 90 bytes while the matrix is made; larger ones are not stored."""
+    for grid, entries in (
+        (Grid((30, 30, 30)), 243 * 30**3),
+        (Grid((200, 100)), 36 * 20_000),
+        (Grid((200,) * 3), 2**26),
+    ):
+        more = footprint(grid, 1, settings_of(solver="assembled")) - footprint(grid, 1, settings_of(solver="cg"))
+        assert more == 90 * entries
+
+
 def test_the_limit_of_two_maps_is_the_one_that_was_given():
     """And the size that is advised suffices."""
     grid = Grid((64, 64, 64))

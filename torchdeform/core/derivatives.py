@@ -125,8 +125,8 @@ def _by_shifts(field: Tensor, dim: int, kernel: tuple[float, ...], step: float) 
 
 _CONVOLVE = {2: F.conv2d, 3: F.conv3d}
 
-# ``auto`` is by shifts: on two threads of a CPU conv2d takes 2 to 5 times as long, conv3d 10 times, from 32² to 128³
-# (``scripts/benchmarks/kernels.py`` measures it, on a GPU too).
+# ``auto`` is by shifts: convolution takes 1.4 to 8 times as long on one thread of a CPU (64² to 1024², 32³ to 128³) and
+# 1.6 to 11 times on an H100 (512² to 160×192×224); see ``scripts/benchmarks/kernels.py``.
 _WAYS = {"auto": _by_shifts, "shifts": _by_shifts, "convolution": _by_convolution}
 
 

@@ -10,6 +10,9 @@ import torch
 from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import MIN_NODES, with_spacing
 from torchdeform.errors import InputError
+from torchdeform.fem.solver import LARGEST_MATRIX
+from torchdeform.fem.system import DivCurlSystem
+from torchdeform.fem.weights import Weights
 from torchdeform.metrics.similarity import Measure, measures_in
 from torchdeform.registration.settings import RegistrationSettings
 
@@ -33,6 +36,8 @@ _PROCESS_BYTES = 4.5e8
 _PER_NODE = {2: 100.0, 3: 80.0}
 # The same of a discrete start, whatever the similarity: per node, and per node and channel. What holds more counts.
 _DISCRETE = {2: (130.0, 75.0), 3: (100.0, 65.0)}
+# And of an assembled matrix while it is made: per entry.
+_PER_ENTRY = 90
 # And of reading, joining, judging and writing on the fixed grid, however coarse the finest level is.
 _FILES = {2: (65.0, 48.0), 3: (80.0, 26.0)}
 
@@ -58,7 +63,13 @@ def footprint(grid: Grid, channels: int, settings: RegistrationSettings) -> int:
     maps = 2 if symmetric else 1
     per_channel = sum(measure.memory[grid.dim - 2] for measure in measures.values())
     rates = [(maps * _PER_NODE[grid.dim], maps * per_channel), *([_DISCRETE[grid.dim]] if discrete else [])]
-    return max(_affine(grid, channels, rate) for rate in rates)
+    return max(_affine(grid, channels, rate) for rate in rates) + _matrix(grid, settings)
+
+
+def _matrix(grid: Grid, settings: RegistrationSettings) -> int:
+    """Return the bytes of the largest matrix that is assembled, 0 where none is."""
+    entries = DivCurlSystem(grid, Weights()).matrix_entries
+    return _PER_ENTRY * min(entries, LARGEST_MATRIX) if settings.solver.method == "assembled" else 0
 
 
 def _affine(grid: Grid, channels: int, rate: tuple[float, float]) -> int:
