@@ -80,7 +80,7 @@ def separable_transform(x: Tensor, kinds: Kinds, *, out: Tensor | None = None) -
 
     Notes:
         Self-adjoint, so its derivative is itself, to every degree. One product per item, channel and axis: nothing is
-        copied, and a batch gives the results of its items bit for bit.
+        copied. A batch gives the results of its items to rounding: a product may round by where its memory begins.
     """
     return _SeparableTransform.apply(x, kinds) if out is None else _separable(x, kinds, out)
 
