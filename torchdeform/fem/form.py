@@ -49,9 +49,13 @@ def div_curl_form(dim: int, weights: Weights) -> Form:
     """
     div = Row(weights.div, tuple(Term(1.0, k, k) for k in range(dim)))
     curl = [Row(weights.curl, (Term(1.0, b, a), Term(-1.0, a, b))) for a, b in CURL_PAIRS[dim]]
-    value = [Row(weights.zero, (Term(1.0, k, None),)) for k in range(dim)]
     has_values = isinstance(weights.zero, Tensor) or weights.zero > 0
-    return (div, *curl, *(value if has_values else ()))
+    return (div, *curl, *(value_form(dim, weights.zero) if has_values else ()))
+
+
+def value_form(dim: int, weight: Coefficient = 1.0) -> Form:
+    """Return the form of ∫ weight |v|²: one row for each component of v."""
+    return tuple(Row(weight, (Term(1.0, k, None),)) for k in range(dim))
 
 
 def gradient_form(dim: int, components: int = 1) -> Form:

@@ -11,7 +11,7 @@ from torchdeform.core.derivatives import CURL_PAIRS
 from torchdeform.core.grid import Grid
 from torchdeform.fem.assembly import assemble, constrain_matrix
 from torchdeform.fem.boundary import Boundary, constrain, fixed_unknowns, lift
-from torchdeform.fem.form import Form, Row, Term, div_curl_form
+from torchdeform.fem.form import Form, div_curl_form, value_form
 from torchdeform.fem.operator import apply_form, assemble_load, form_diagonal
 from torchdeform.fem.weights import Weights
 
@@ -56,8 +56,7 @@ class DivCurlSystem:
         """
         form = self._form(self.weights)
         turns = len(CURL_PAIRS[self.grid.dim])
-        forces = tuple(Row(1.0, (Term(1.0, k, None),)) for k in range(self.grid.dim))
-        parts = [(form[:1], div), (form[1 : 1 + turns], curl), (forces, force)]
+        parts = [(form[:1], div), (form[1 : 1 + turns], curl), (value_form(self.grid.dim), force)]
         rows = tuple(row for some, data in parts if data is not None for row in some)
         given = [data for _, data in parts if data is not None]
         load = assemble_load(rows, torch.cat(given, dim=1) if len(given) > 1 else given[0], self.grid)
@@ -88,8 +87,7 @@ class DivCurlSystem:
 
     def mass(self, v: Tensor) -> Tensor:
         """Return M v, M being the mass matrix on the free unknowns."""
-        values = tuple(Row(1.0, (Term(1.0, k, None),)) for k in range(self.grid.dim))
-        return self.free(assemble_load(values, v, self.grid))
+        return self.free(self.load(force=v))
 
     def diagonal(self, like: Tensor) -> Tensor:
         """Return the diagonal of K ``(B, D, *S)`` with the type and device of ``like``."""

@@ -51,8 +51,8 @@ def div_curl_velocity(
     data: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str, solver: str = "auto"
 ) -> Tensor:
     """Return v = K⁻¹ A data: the velocity of divergence and curl ``data (B, 1 + C, *S)``, see `DivCurlVelocity`."""
-    system = DivCurlSystem(_grid_of(data, spacing), Weights(*weights), boundary)
-    return _factor(data, spacing, weights, boundary, solver)(system.load(div=data[:, :1], curl=data[:, 1:]))
+    factor = _factor(data, spacing, weights, boundary, solver)
+    return factor(factor.system.load(div=data[:, :1], curl=data[:, 1:]))
 
 
 @torch.library.custom_op("torchdeform::div_curl_adjoint", mutates_args=())
@@ -60,13 +60,12 @@ def div_curl_adjoint(
     slope: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str, solver: str = "auto"
 ) -> Tensor:
     """Return Aᵀ K⁻¹ slope, ``(B, 1 + C, *S)``: the transpose of `div_curl_velocity`, since K is symmetric."""
-    solved = _factor(slope, spacing, weights, boundary, solver)(slope)
-    system = DivCurlSystem(_grid_of(slope, spacing), Weights(*weights), boundary)
-    found = []
-    for name, channels in (("div", 1), ("curl", len(CURL_PAIRS[system.grid.dim]))):
+    factor = _factor(slope, spacing, weights, boundary, solver)
+    solved, found = factor(slope), []
+    for name, channels in (("div", 1), ("curl", len(CURL_PAIRS[slope.dim() - 2]))):
         data = slope.new_zeros(slope.shape[0], channels, *slope.shape[2:]).requires_grad_()
         with torch.enable_grad():
-            found += torch.autograd.grad(system.load(**{name: data}), data, solved)
+            found += torch.autograd.grad(factor.system.load(**{name: data}), data, solved)
     return torch.cat(found, dim=1)
 
 

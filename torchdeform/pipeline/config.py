@@ -208,9 +208,9 @@ def _whole_group(name: str, value: object) -> object:
     """Return the mapping that the short form of a group stands for; weights of measures are one, too."""
     if name not in SHORT_FORMS:
         return value
-    known = {field.name for field in fields(get_type_hints(RegistrationSettings)[name])}
     if not isinstance(value, Mapping):
         return {SHORT_FORMS[name]: value}
+    known = {field.name for field in fields(get_type_hints(RegistrationSettings)[name])}
     weights = name == "similarity" and not known & value.keys() and (not value or MEASURES.keys() & value.keys())
     return {SHORT_FORMS[name]: MappingProxyType(dict(value))} if weights else value
 

@@ -115,6 +115,10 @@ class Objective:
     coupling: Coupling = _FREE
 
 
+# From the problem on a level's grid, the grid of its map, and the settings.
+MakeObjective = Callable[[RegistrationProblem, Grid, RegistrationSettings], Objective]
+
+
 @dataclass(frozen=True)
 class Level:
     """What stays the same during the steps of one level.
@@ -181,12 +185,18 @@ class State:
     shortened: int = 0
 
 
+def forward_objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
+    """Return what is maximised where the moving image is warped onto the fixed one, the map being on ``grid``."""
+    pairs = problem.pairs if settings.points_weight > 0 else None
+    return Objective(forward_similarity(problem, settings), pairs and ForwardLandmarks(*pairs, grid))
+
+
 def optimise_levels(
     problem: RegistrationProblem,
     settings: RegistrationSettings,
     start: Tensor | None,
     callback: Callback | None,
-    objective: Callable[[RegistrationProblem, Grid, RegistrationSettings], Objective] | None = None,
+    objective: MakeObjective = forward_objective,
 ) -> tuple[Tensor, tuple[LevelRecord, ...]]:
     """Return the maps that make the images of the problem most similar, and how each level went.
 
@@ -195,13 +205,13 @@ def optimise_levels(
         settings: how.
         start: maps to begin with ``(B, D, *S)`` in units of spacing, on any grid of the box; zero when None.
         callback: is shown every step.
-        objective: makes what is maximised on the grid of a level; `forward_objective` when None.
+        objective: makes what is maximised on the grid of a level.
     """
     grids = pyramid_grids(problem.grid, len(settings.optimiser.steps))
     u, records = start, []
     for index, grid in enumerate(grids):
         began = perf_counter()
-        level = make_level(problem.on(grid), settings, objective or forward_objective, index, len(grids))
+        level = make_level(problem.on(grid), settings, objective, index, len(grids))
         u = level.zero if u is None else repair_folds(prolong(u, level.grid), level.grid)
         with limit_threads(len(u), grid):
             state = optimise_level(level, u, callback)
@@ -212,16 +222,10 @@ def optimise_levels(
     return repair_folds(prolong(u, problem.grid), problem.grid), tuple(records)
 
 
-def forward_objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
-    """Return what is maximised where the moving image is warped onto the fixed one, the map being on ``grid``."""
-    pairs = problem.pairs if settings.points_weight > 0 else None
-    return Objective(forward_similarity(problem, settings), pairs and ForwardLandmarks(*pairs, grid))
-
-
 def make_level(
     problem: RegistrationProblem,
     settings: RegistrationSettings,
-    objective: Callable[[RegistrationProblem, Grid, RegistrationSettings], Objective],
+    objective: MakeObjective,
     index: int,
     levels: int,
 ) -> Level:

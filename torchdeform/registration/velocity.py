@@ -25,12 +25,10 @@ class VelocityMetric:
     """The div-curl least squares as a metric: K v = load, w_zero = w_div / length².
 
     Attributes:
-        system: K on the grid of the map.
-        factor: the solver made ready for it.
+        factor: the solver made ready for K on the grid of the map.
         order: power of the metric, see `Factor`.
     """
 
-    system: DivCurlSystem
     factor: Factor
     order: int = 1
 
@@ -49,7 +47,12 @@ class VelocityMetric:
     ) -> "VelocityMetric":
         """Return the metric with these weights; nothing flows out of the box."""
         system = DivCurlSystem(grid, weights, "slip")
-        return cls(system, solver_of(solver, system).init(system, like), order)
+        return cls(solver_of(solver, system).init(system, like), order)
+
+    @property
+    def system(self) -> DivCurlSystem:
+        """K and its loads."""
+        return self.factor.system
 
     @property
     def grid(self) -> Grid:

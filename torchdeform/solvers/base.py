@@ -76,7 +76,13 @@ class System(Protocol):
 
 
 class Factor(ABC):
-    """A solver made ready for one system."""
+    """A solver made ready for one system.
+
+    Attributes:
+        system: that system.
+    """
+
+    system: Any
 
     @abstractmethod
     def solution(self, load: Tensor) -> Solution:
