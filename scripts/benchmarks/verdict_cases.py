@@ -173,7 +173,9 @@ class Cases:
         """Every pair of the open sets, with what is known of it."""
         for name, pairs in self.sets.items():
             for index, pair in enumerate(pairs):
-                yield Case(GOOD, f"{name} {pair.name}", lambda p=pair: scene(p, labels=True, points=True), index % 2 == 0)
+                yield Case(
+                    GOOD, f"{name} {pair.name}", lambda p=pair: scene(p, labels=True, points=True), index % 2 == 0
+                )
 
     def bad(self) -> Iterator[Case]:
         """Pairs that are wrong in a way that has a name."""
@@ -261,7 +263,12 @@ def _labels(cases: Cases) -> _Made:
 
 
 def _landmarks(cases: Cases) -> _Made:
-    for name, index, steps in (("histology_2d", 0, 1), ("histology_2d", 1, 5), ("lung_ct_3d", 0, 7), ("histology_2d", 3, 20)):
+    for name, index, steps in (
+        ("histology_2d", 0, 1),
+        ("histology_2d", 1, 5),
+        ("lung_ct_3d", 0, 7),
+        ("histology_2d", 3, 20),
+    ):
         pair = cases._pair(name, index)
         yield f"{name} {pair.name}", lambda p=pair, s=steps: with_points_rolled(scene(p, points=True), s)
 
@@ -275,14 +282,25 @@ def _far(cases: Cases) -> _Made:
 
 
 def _spacing(cases: Cases) -> _Made:
-    places = (("mindboggle_2d", 1, 10.0), ("hippocampus_3d", 1, 0.001), ("heart_2d", 2, 1000.0), ("spine_t1t2_3d", 0, 0.1))
+    places = (
+        ("mindboggle_2d", 1, 10.0),
+        ("hippocampus_3d", 1, 0.001),
+        ("heart_2d", 2, 1000.0),
+        ("spine_t1t2_3d", 0, 0.1),
+    )
     for name, index, factor in (*places, ("mindboggle_2d", 4, 0.001), ("heart_2d", 8, 10.0)):
         pair = cases._pair(name, index)
         yield f"{name} {pair.name}, × {factor:g}", lambda p=pair, f=factor: changed(p, rescaled(f))
 
 
 def _contrast(cases: Cases) -> _Made:
-    for name, index in (("heart_2d", 1), ("mindboggle_2d", 0), ("hippocampus_3d", 4), ("mindboggle_2d", 5), ("heart_2d", 9)):
+    for name, index in (
+        ("heart_2d", 1),
+        ("mindboggle_2d", 0),
+        ("hippocampus_3d", 4),
+        ("mindboggle_2d", 5),
+        ("heart_2d", 9),
+    ):
         pair = cases._pair(name, index)
         yield f"{name} {pair.name}", lambda p=pair: changed_image(p, inverted, similarity="ssd")
 
@@ -294,7 +312,12 @@ def changed_image(pair: Pair, change: Callable[[td.Image], td.Image], **override
 
 
 def _heavy_noise(cases: Cases) -> _Made:
-    for name, index, strength in (("heart_2d", 3, 3.0), ("mindboggle_2d", 2, 3.0), ("hippocampus_3d", 3, 2.0), ("spine_t1t2_3d", 0, 3.0)):
+    for name, index, strength in (
+        ("heart_2d", 3, 3.0),
+        ("mindboggle_2d", 2, 3.0),
+        ("hippocampus_3d", 3, 2.0),
+        ("spine_t1t2_3d", 0, 3.0),
+    ):
         pair = cases._pair(name, index)
         yield f"{name} {pair.name}", lambda p=pair, s=strength: changed_image(p, noisy(s), masks=False)
 
@@ -306,9 +329,18 @@ def _only_noise(cases: Cases) -> _Made:
 
 
 def _resection(cases: Cases) -> _Made:
-    for name, index in (("mindboggle_2d", 1), ("hippocampus_3d", 1), ("heart_2d", 0), ("mindboggle_2d", 6), ("hippocampus_3d", 6)):
+    for name, index in (
+        ("mindboggle_2d", 1),
+        ("hippocampus_3d", 1),
+        ("heart_2d", 0),
+        ("mindboggle_2d", 6),
+        ("hippocampus_3d", 6),
+    ):
         pair = cases._pair(name, index)
-        yield f"{name} {pair.name}", lambda p=pair, i=index: changed_image(p, lambda m: quarter(m, last=i > 1), masks=False)
+        yield (
+            f"{name} {pair.name}",
+            lambda p=pair, i=index: changed_image(p, lambda m: quarter(m, last=i > 1), masks=False),
+        )
 
 
 def _measure(cases: Cases) -> _Made:

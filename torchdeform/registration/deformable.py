@@ -17,7 +17,9 @@ from torchdeform.core.warp import invert, warp
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.metrics.evaluation import evaluate_images, evaluate_tensors
 from torchdeform.registration.affine.align import Alignment, align
+from torchdeform.registration.agreement import disagreement
 from torchdeform.registration.discrete import discrete_start
+from torchdeform.registration.evidence import gather_evidence, to_compare
 from torchdeform.registration.optimise import forward_similarity, optimise_levels
 from torchdeform.registration.problem import (
     Annotations,
@@ -103,12 +105,20 @@ def _register_tensors(
     require_finite(problem.fixed, problem.moving, "register")
     problem = problem.scaled(settings)
     space = midspace_of_tensors(problem) if settings.symmetric else None
-    found = _optimise(problem, space, settings, start, callback)
+    found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
     del problem, space
     with limit_threads(len(found.u), grid):
         warped = warp(moving, found.u, grid)
         evaluation = evaluate_tensors(found.u, grid, labels=annotations.labels, points=annotations.points)
-    return replace(_result(found, grid, warped, settings), evaluation=evaluation)
+    return _examined(replace(_result(found, grid, warped, settings), evaluation=evaluation), compared)
+
+
+def _examined(result: RegistrationResult, compared: RegistrationProblem) -> RegistrationResult:
+    """Return the result with its evidence, from images on a grid of few nodes."""
+    began = perf_counter()
+    maps = (result.displacement, result.inverse, result.grid)
+    evidence = gather_evidence(compared, *maps, disagreement=disagreement(compared))
+    return replace(result, evidence=evidence, seconds=result.seconds | {"judge": perf_counter() - began})
 
 
 def _checked_grid(fixed: Tensor, moving: Tensor, annotations: Annotations) -> Grid:
@@ -148,17 +158,20 @@ def _register_images(
     aligned = both[1] if affine is None else both[1].moved(affine.inverse())
     problem = resample_pair(both[0], aligned, fixed).scaled(settings)
     space = _midspace(*both, problem, affine, settings) if settings.symmetric else None
-    found = _optimise(problem, space, settings, start, callback)
+    found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
     del problem, space
     warped = _warped(fixed, moving, affine, found.u)
     result = _result(found, fixed.grid, warped, settings)
-    return replace(
+    result = replace(
         result,
         affine=affine,
         alignment=alignment,
+        warnings=alignment.warnings if alignment else (),
+        unit="mm",
         evaluation=evaluate_images(fixed, affine, found.u, labels=annotations.labels, points=annotations.points),
         seconds=({"align": alignment.seconds} if alignment else {}) | result.seconds,
     )
+    return _examined(result, compared)
 
 
 def _align(fixed: Image, moving: Image, settings: RegistrationSettings, annotations: Annotations) -> Alignment:
