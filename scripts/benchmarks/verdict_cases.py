@@ -17,7 +17,7 @@ from torchdeform.io.images import read_labels, read_optional
 from torchdeform.io.points import matched, read_points
 from torchdeform.registration.problem import Annotations
 
-GOOD = "good pair"
+GOOD_PAIR = "good pair"
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class Cases:
         for name, pairs in self.sets.items():
             for index, pair in enumerate(pairs):
                 yield Case(
-                    GOOD, f"{name} {pair.name}", lambda p=pair: scene(p, labels=True, points=True), index % 2 == 0
+                    GOOD_PAIR, f"{name} {pair.name}", lambda p=pair: scene(p, labels=True, points=True), index % 2 == 0
                 )
 
     def bad(self) -> Iterator[Case]:
@@ -380,4 +380,4 @@ _KINDS: dict[str, Callable[[Cases], _Made]] = {
     "wrong similarity": _measure,
     "overlap destroyed": _destroyed,
 }
-KINDS = (GOOD, *_KINDS)
+KINDS = (GOOD_PAIR, *_KINDS)

@@ -14,7 +14,9 @@ from torchdeform.registration.settings import OptimiserSettings, RegistrationSet
 _AGREE = 1.0
 
 _SETTINGS = RegistrationSettings(
-    align="none", similarity=SimilaritySettings(measure="lncc", window=7), optimiser=OptimiserSettings(steps=(25,))
+    align="none",
+    similarity=SimilaritySettings(measure="lncc", window=7),
+    optimiser=OptimiserSettings(steps=(10,), step_length=2.0),  # 25 steps of 1 tell no more
 )
 
 

@@ -19,7 +19,7 @@ from torchdeform.metrics.evaluation import evaluate_images, evaluate_tensors
 from torchdeform.registration.affine.align import Alignment, align
 from torchdeform.registration.agreement import disagreement
 from torchdeform.registration.discrete import discrete_start
-from torchdeform.registration.evidence import gather_evidence, to_compare
+from torchdeform.registration.evidence import gather_evidence, to_compare, with_labels
 from torchdeform.registration.optimise import forward_similarity, optimise_levels
 from torchdeform.registration.problem import (
     Annotations,
@@ -110,14 +110,22 @@ def _register_tensors(
     with limit_threads(len(found.u), grid):
         warped = warp(moving, found.u, grid)
         evaluation = evaluate_tensors(found.u, grid, labels=annotations.labels, points=annotations.points)
-    return _examined(replace(_result(found, grid, warped, settings), evaluation=evaluation), compared)
+    result = replace(_result(found, grid, warped, settings), evaluation=evaluation)
+    return _examined(result, compared, (fixed, moving), annotations.labels)
 
 
-def _examined(result: RegistrationResult, compared: RegistrationProblem) -> RegistrationResult:
-    """Return the result with its evidence, from images on a grid of few nodes."""
+def _examined(
+    result: RegistrationResult,
+    compared: RegistrationProblem,
+    images: tuple[Tensor, Tensor],
+    labels: tuple[Tensor, Tensor] | None,
+) -> RegistrationResult:
+    """Return the result with its evidence, from images on a grid of few nodes, and labels on the images' own grids."""
     began = perf_counter()
     maps = (result.displacement, result.inverse, result.grid)
     evidence = gather_evidence(compared, *maps, disagreement=disagreement(compared))
+    if labels is not None:
+        evidence = with_labels(evidence, images, labels)
     return replace(result, evidence=evidence, seconds=result.seconds | {"judge": perf_counter() - began})
 
 
@@ -171,7 +179,9 @@ def _register_images(
         evaluation=evaluate_images(fixed, affine, found.u, labels=annotations.labels, points=annotations.points),
         seconds=({"align": alignment.seconds} if alignment else {}) | result.seconds,
     )
-    return _examined(result, compared)
+    both = annotations.labels
+    labels = both and (resample(both[0], fixed, mode="nearest"), resample(both[1], moving, mode="nearest"))
+    return _examined(result, compared, (fixed.data, moving.data), labels)
 
 
 def _align(fixed: Image, moving: Image, settings: RegistrationSettings, annotations: Annotations) -> Alignment:

@@ -14,7 +14,6 @@ from torchdeform.core.grid import Grid, limit_threads
 from torchdeform.core.resampling import box_sum, prolong, restrict, with_spacing
 from torchdeform.core.warp import sample, voxels, warp
 from torchdeform.metrics.correlation import contrast, lncc
-from torchdeform.metrics.information import normalised_mutual_information
 from torchdeform.registration.problem import RegistrationProblem
 
 # Nodes at most of the two grids that images are looked at on: one shows whether they show the same, the other where
@@ -27,10 +26,13 @@ _WINDOW = 7  # width of the windows that are correlated, in voxels
 # What similarity is measured against: the moving image pushed along each axis by these shares of the box.
 _AWAY = (0.2, -0.2, 0.35)
 
+_MOST_LABELS = 12  # that are looked at, the largest
+_SEEN = 60_000  # voxels at most at which labels are compared with their image
 _EXTREME = 3.0  # a change of volume by more than this factor is extreme
 _TRIED = 50_000  # points at which the inverse is tried, at most
 _EDGES = 0.1  # share of the voxels, those with the largest gradients, that are edges
-_BINS = 24  # grey levels that mutual information tells apart
+_LEVELS = 16  # grey levels that mutual information tells apart
+_LEAST = 0.05  # information of an image about itself that counts as none
 _BETTER = 0.2  # by so much more information a turned image has to fit better
 _KNOWN = 0.5  # weight from which on a voxel counts
 _TINY = 1e-9
@@ -61,6 +63,8 @@ class Evidence:
         turned: axes of the fixed grid, ``x``, ``y``, ``z``, along which the moving image fits clearly better when it is
             turned over.
         absent: share of what has contrast where the similarity was let go.
+        label_contrast: how well the labels go with the fixed and with the moving image, see `label_contrast`; None
+            without labels.
     """
 
     correlation_before: float
@@ -78,6 +82,7 @@ class Evidence:
     covered: float
     turned: tuple[str, ...] = ()
     absent: float = 0.0
+    label_contrast: tuple[float, float] | None = None
 
 
 def to_compare(problem: RegistrationProblem) -> RegistrationProblem:
@@ -122,19 +127,24 @@ def gather_evidence(
     with limit_threads(1, problem.grid):
         return tuple(
             _of_item(
-                _item(problem, k), u[k : k + 1], inverse[k : k + 1], grid, float(disagreement[k]), _part(absent, k)
+                _item(problem, k),
+                _part(u, k),
+                _part(inverse, k),
+                grid,
+                float(apart),
+                None if absent is None else _part(absent, k),
             )
-            for k in range(len(u))
+            for k, apart in enumerate(disagreement)
         )
 
 
 def _item(problem: RegistrationProblem, index: int) -> RegistrationProblem:
-    fields = ("fixed", "moving", "fixed_mask", "moving_mask")
-    return replace(problem, **{name: _part(getattr(problem, name), index) for name in fields})
+    fields = {name: getattr(problem, name) for name in ("fixed", "moving", "fixed_mask", "moving_mask")}
+    return replace(problem, **{name: None if f is None else _part(f, index) for name, f in fields.items()})
 
 
-def _part(field: Tensor | None, index: int) -> Tensor | None:
-    return None if field is None else field[index : index + 1] if len(field) > 1 else field
+def _part(field: Tensor, index: int) -> Tensor:
+    return field[index : index + 1] if len(field) > 1 else field
 
 
 def _of_item(
@@ -238,18 +248,19 @@ class Views:
         pushes = (partial(_rolled, axis=axis, share=share) for axis, share in product(self.grid.axes, _AWAY))
         away = [self._moved(push)._mutual() for push in pushes]
         least, most = sum(away) / len(away), replace(self, moving=self.fixed)._mutual()
-        return [(view._mutual() - least) / max(most - least, _TINY) for view in views]
+        return [(view._mutual() - least) / max(most - least, _LEAST) for view in views]
 
     def _moved(self, move: Callable[[Tensor], Tensor]) -> "Views":
         return replace(self, moving=move(self.moving), moving_weight=move(self.moving_weight))
 
     def _mutual(self) -> float:
-        if not bool(self.both.any()):
-            return 1.0  # that of independent images
-        fixed, moving = self.fixed, self.moving
-        ends = (0.0, 1.0)
-        value = normalised_mutual_information(fixed, moving, mask=self.both, bins=_BINS, intensity_range=ends)
-        return float(value)
+        """Return (H_f + H_m) / H of the grey levels where both images are known, 1 for independent images."""
+        known = self.both > 0
+        if not bool(known.any()):
+            return 1.0
+        table = _joint_histogram(self.fixed[known], self.moving[known])
+        parts = (_entropy(table.sum(axis)) for axis in (0, 1))
+        return sum(parts) / max(_entropy(table), _TINY)
 
     def edge_distance(self) -> float:
         """Return the mean distance in voxels between strong edges of one image and the nearest of the other."""
@@ -275,6 +286,23 @@ def _variance(image: Tensor) -> Tensor:
     return (box_sum(image * image, _WINDOW) / count - mean * mean).clamp(min=0)
 
 
+def _joint_histogram(one: Tensor, other: Tensor) -> Tensor:
+    """Return the histogram of pairs of values from 0 to 1, each shared between the two nearest levels."""
+    places = [values.double().clamp(0, 1) * (_LEVELS - 1) for values in (one, other)]
+    i, j = (place.long().clamp(max=_LEVELS - 2) for place in places)
+    s, t = places[0] - i, places[1] - j
+    table = torch.zeros(_LEVELS**2, dtype=torch.float64, device=one.device)
+    for di, dj in product((0, 1), (0, 1)):
+        share = (s if di else 1 - s) * (t if dj else 1 - t)
+        table += torch.bincount((i + di) * _LEVELS + j + dj, share, _LEVELS**2)
+    return table.view(_LEVELS, _LEVELS)
+
+
+def _entropy(counts: Tensor) -> float:
+    share = counts[counts > 0] / counts.sum()
+    return -float((share * share.log()).sum())
+
+
 def _rolled(field: Tensor, axis: int, share: float) -> Tensor:
     return field.roll(round(share * field.shape[axis]), axis)
 
@@ -295,3 +323,45 @@ def otsu(values: Tensor) -> float:
     above = below[-1] - below
     between = (total * below[-1] - total[-1] * below).square() / (below * above).clamp(min=1)
     return float(centre[between.argmax()])
+
+
+def with_labels(
+    evidence: tuple[Evidence, ...], images: tuple[Tensor, Tensor], labels: tuple[Tensor, Tensor]
+) -> tuple[Evidence, ...]:
+    """Return the evidence with how well labels go with their images, all ``(B or 1, C or 1, *S)``."""
+    found = []
+    for index, known in enumerate(evidence):
+        pairs = zip(images, labels, strict=True)
+        first, second = (label_contrast(_part(image, index), _part(regions, index)) for image, regions in pairs)
+        found.append(replace(known, label_contrast=(first, second)))
+    return tuple(found)
+
+
+def label_contrast(image: Tensor, labels: Tensor) -> float:
+    """Return which share of the variance in and around a label it explains, the mean over the largest labels.
+
+    Args:
+        image: ``(1, C, *S)``.
+        labels: ``(1, 1, *S)``, whole numbers, 0 for nothing.
+
+    Notes:
+        Around a label is a margin that is about as large as it is. Labels of another image explain little.
+    """
+    stride = math.ceil((labels.numel() / _SEEN) ** (1 / (labels.dim() - 2)))
+    some = (slice(None), slice(None), *[slice(None, None, stride)] * (labels.dim() - 2))
+    grey, labels = image.float().mean(1, keepdim=True)[some], labels[some]
+    names, counts = labels[labels != 0].unique(return_counts=True)
+    largest = names[counts.argsort(descending=True)[:_MOST_LABELS]]
+    shares = [_explained(grey, labels == name) for name in largest]
+    return sum(shares) / len(shares) if shares else math.nan
+
+
+def _explained(grey: Tensor, region: Tensor) -> float:
+    """Return 1 - (variance inside and outside of a region) / (variance of all), near the region."""
+    dim, size = region.dim() - 2, float(region.sum())
+    margin = max(1, round(size ** (1 / dim) * (2 ** (1 / dim) - 1) / 2))
+    near = box_sum(region.to(grey), 2 * margin + 1) > _KNOWN
+    around = grey[near]
+    parts = grey[region], grey[near & ~region]
+    left = sum(float((part - part.mean()).square().sum()) for part in parts if len(part))
+    return 1 - left / max(float((around - around.mean()).square().sum()), _TINY)

@@ -17,11 +17,11 @@ MARKS = {GOOD: "✓", LOOK: "!", BAD: "✗"}
 
 # Thresholds, from the half of the cases of `scripts/benchmarks/verdict.py` that may choose them. In brackets: the
 # worst of the good pairs of one contrast, and the best of the pairs that show something else.
-_INFORMATION = 0.45  # (0.53, 0.39)
+_INFORMATION = 0.48  # (0.53, 0.44)
 _NO_INFORMATION = 0.25  # less than this is what unrelated pictures reach (0.14)
 _CORRELATION = 0.68  # (0.74, 0.76; unrelated pictures 0.51)
 _DISAGREEMENT = 0.12  # (0.10, 0.18)
-_EXTREME = 0.15  # (0.13, 0.15)
+_EXTREME = 0.18  # (0.13, 0.15)
 _COVERED = 0.6  # (0.67; half an image 0.54)
 _SIGNS = 3  # so many of the four signs that images do not belong together are enough
 
@@ -30,6 +30,7 @@ _INVERSE = 0.5  # voxels
 _ABSENT = 0.05
 _MIRROR = 1.2  # merit of a mirrored alignment over the best one
 
+_SEEN, _UNSEEN = 0.2, 0.4  # contrast of labels in one image, and share of it in the other, from which on they differ
 _STEADY = 0.01  # a change of Dice, or of a distance relative to it, that does not count
 _DROP = 0.1  # a label that loses more overlap is named
 _WORSE = 1 / 3  # share of labels or landmarks that may get worse
@@ -98,7 +99,7 @@ def judge(
     Notes:
         No figure proves that the right tissue is on the right tissue. Only labels, landmarks or a look can show it.
     """
-    known = list(_annotations(evaluation, grid, unit))
+    known = list(_annotations(evaluation, evidence.label_contrast, grid, unit))
     found = [*_folds(folds), *_images(evidence, mirror), *_map(evidence)]
     if evaluation is not None and _proven(evaluation) and all(some.kind == GOOD for some in known):
         found = [replace_bad(some) if some.kind == BAD and folds == 0 else some for some in found]
@@ -198,10 +199,13 @@ def _map(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(LOOK, text, {"inverse_error": e.inverse_error})
 
 
-def _annotations(evaluation: Evaluation | None, grid: Grid, unit: str) -> Iterator[Finding]:
+def _annotations(
+    evaluation: Evaluation | None, contrast: tuple[float, float] | None, grid: Grid, unit: str
+) -> Iterator[Finding]:
     if evaluation is None:
         return
     if evaluation.after.labels:
+        yield from _own_images(contrast)
         yield from _labels(evaluation)
         yield from _surfaces(evaluation, grid, unit)
     distances = [stage.distances for stage in (evaluation.before, evaluation.after)]
@@ -216,6 +220,15 @@ def _proven(evaluation: Evaluation) -> bool:
         gain = _mean(after.dice) - _mean(before.dice)
         return gain > _PROVEN and _mean(after.dice) >= 0.5
     return False
+
+
+def _own_images(contrast: tuple[float, float] | None) -> Iterator[Finding]:
+    """Whether the labels of both images go with them equally well."""
+    if contrast is not None and max(contrast) > _SEEN and min(contrast) < _UNSEEN * max(contrast):
+        name = ("fixed", "moving")[contrast.index(min(contrast))]
+        text = f"The labels of the {name} image do not go with it (they explain {min(contrast):.0%} of the contrast in "
+        text += f"and around them, those of the other image {max(contrast):.0%})."
+        yield Finding(BAD, text, {"fixed": contrast[0], "moving": contrast[1]})
 
 
 def _labels(evaluation: Evaluation) -> Iterator[Finding]:
