@@ -15,10 +15,11 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
+from verdict_cases import GOOD_PAIR, KINDS, Case, Cases
+
 import torchdeform as td
 from torchdeform.pipeline.preflight import ERROR, WARNING, preflight
-from torchdeform.registration.verdict import BAD, GOOD, LOOK, judge
-from verdict_cases import GOOD_PAIR, KINDS, Case, Cases
+from torchdeform.registration.verdict import BAD, GOOD, LOOK
 
 VERDICTS = (GOOD, LOOK, BAD)
 # Kinds that must be bad, not only doubtful.
@@ -43,7 +44,9 @@ def misses(rows: Iterable[tuple[Case, td.Verdict]]) -> list[str]:
     found = []
     for case, verdict in rows:
         must = case.kind in MUST_BE_BAD
-        wrong = verdict.kind != GOOD if case.kind == GOOD_PAIR else verdict.kind == GOOD or (must and verdict.kind != BAD)
+        wrong = (
+            verdict.kind != GOOD if case.kind == GOOD_PAIR else verdict.kind == GOOD or (must and verdict.kind != BAD)
+        )
         found += [f"{case.kind} | {case.name}: {verdict.kind}. {verdict.headline}"] if wrong else []
     return found
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from torchdeform.core.flow import OdeSolver
 from torchdeform.errors import RANGES, InputError, require_choice, require_ranges
 from torchdeform.fem.solver import SolverSettings
-from torchdeform.metrics.similarity import similarity_weights
+from torchdeform.metrics.similarity import AUTO, similarity_weights
 from torchdeform.registration.affine.settings import AlignmentSettings
 
-STARTS = ("identity", "discrete")
+STARTS = (AUTO, "identity", "discrete")
 STENCILS = ("auto", "convolution", "shifts")
 
 
@@ -18,7 +18,8 @@ class SimilaritySettings:
     """What is compared, and how.
 
     Args:
-        measure: ``lncc`` (squared local normalised cross-correlation, for images of one contrast with different
+        measure: ``auto`` (``lncc`` for images of one contrast, ``mind`` for others; without `Image`s or a look at them
+            it is ``lncc``), ``lncc`` (squared local normalised cross-correlation, for images of one contrast with different
             brightness), ``ncc`` (the correlation of whole images), ``ssd`` (mean squared difference, for images on the
             same intensity scale); for images of different contrast ``mi`` and ``nmi`` (mutual information, normalised),
             ``ngf`` (directions of the gradients), ``mind`` (self-similarity of patches). Or several of them with
@@ -29,7 +30,7 @@ class SimilaritySettings:
         InputError: a value out of range, named.
     """
 
-    measure: str | Mapping[str, float] = "lncc"
+    measure: str | Mapping[str, float] = AUTO
     window: int = 9
 
     def __post_init__(self) -> None:
@@ -195,8 +196,8 @@ class RegistrationSettings:
     Args:
         align: how images (not tensors) are aligned first; as one value its ``kind``: ``none``, ``translation``,
             ``rigid``, ``similarity`` or ``affine``.
-        start: map to begin with: ``identity``, or ``discrete`` for one from a search over large displacements, see
-            `discrete_start`.
+        start: map to begin with: ``identity``, ``discrete`` for one from a search over large displacements, see
+            `discrete_start`, or ``auto``: discrete where ``mind`` is compared.
         discrete: settings of that search.
         similarity: what is compared; as one value its ``measure``.
         metric: what a velocity costs.
@@ -216,7 +217,7 @@ class RegistrationSettings:
     """
 
     align: AlignmentSettings = _ALIGN
-    start: str = "identity"
+    start: str = AUTO
     discrete: DiscreteSettings = _DISCRETE
     similarity: SimilaritySettings = _SIMILARITY
     metric: MetricSettings = _METRIC
@@ -236,3 +237,13 @@ class RegistrationSettings:
         require_choice(self.start, STARTS, "start")
         require_choice(self.stencil, STENCILS, "stencil")
         require_ranges(self, "", points_weight="finite, not negative")
+
+    @property
+    def starts_discretely(self) -> bool:
+        """Whether the map to begin with is searched for."""
+        return self.start == "discrete" or (self.start == AUTO and self.similarity.measure == "mind")
+
+    def with_similarity(self, measure: str | Mapping[str, float]) -> "RegistrationSettings":
+        """Return the same with this measure, and the start that goes with it in place of ``auto``."""
+        chosen = replace(self, similarity=replace(self.similarity, measure=measure))
+        return replace(chosen, start="discrete" if chosen.starts_discretely else "identity")
