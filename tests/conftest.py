@@ -144,6 +144,7 @@ _FINE = Evidence(
     correlation=0.9,
     information_before=0.4,
     information=0.7,
+    structure_before=0.5,
     edges_before=2.0,
     edges=0.5,
     foreground_before=0.8,
