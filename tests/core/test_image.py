@@ -109,3 +109,15 @@ def test_device_is_moved():
     image = Image(torch.zeros(1, 1, 4, 4), Grid((4, 4)), (1.0, 2.0), name="slice")
     moved = image.to("meta")
     assert (moved.data.device.type, moved.origin, moved.name) == ("meta", (1.0, 2.0), "slice")
+
+
+@pytest.mark.parametrize(("unit", "shown"), [("px", 2.5), ("mm", 2.5), ("µm", 2500.0)])
+def test_lengths_are_shown_in_the_unit_of_the_image(unit, shown):
+    image = Image(torch.zeros(1, 1, 4, 4), Grid((4, 4)), unit=unit)
+    assert image.in_unit(2.5) == shown
+    assert image.in_unit(torch.tensor([2.5])).item() == shown
+
+
+def test_unknown_units_are_refused():
+    with pytest.raises(InputError, match="slice: unit must be one of px, mm, µm, got 'inch'"):
+        Image(torch.zeros(1, 1, 4, 4), Grid((4, 4)), name="slice", unit="inch")

@@ -127,8 +127,8 @@ def summary(outcome: Outcome) -> str:
 def _measured(record: dict[str, Any]) -> dict[str, str]:
     """Return lines about labels and landmarks, if they were given."""
     lines = {}
-    for key, name in (("dice_mean", "Dice"), ("landmark_error_mean", "landmark error")):
+    for key, name, unit in (("dice_mean", "Dice", ""), ("landmark_error_mean", "landmark error", f" {record['unit']}")):
         figures = [f"{stage[key]:.4g}" for stage in record["evaluation"].values() if key in stage]
         if figures:
-            lines[name] = " -> ".join(figures)
+            lines[name] = " -> ".join(figures) + unit
     return lines

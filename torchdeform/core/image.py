@@ -2,17 +2,23 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid, over_slabs
 from torchdeform.core.warp import inside_box, sample
-from torchdeform.errors import InputError
+from torchdeform.errors import InputError, require_choice
 
 # Alpha that means opaque, by pixel type; floating types count from 0 to 1.
 _OPAQUE = {"uint8": 255.0, "uint16": 65535.0}
 _RGBA = 4
+
+# Units that lengths are shown in, and how long 1 of the world's coordinates is in them.
+UNITS = {"px": 1.0, "mm": 1.0, "µm": 1000.0}
+
+_Length = TypeVar("_Length", float, Tensor)
 
 
 @dataclass(frozen=True)
@@ -27,9 +33,11 @@ class Image:
             default.
         name: what to call it in messages, usually its path.
         pixel_type: numpy name of the type it is stored with, for writing results alike.
+        unit: what its lengths are shown in: ``px`` for files without a spacing, whose pixels are 1 apart, ``mm``, or
+            ``µm`` where the file has it. Coordinates are in mm with both of the latter.
 
     Raises:
-        InputError: the parts do not fit together.
+        InputError: the parts do not fit together, or an unknown unit.
     """
 
     data: Tensor
@@ -38,6 +46,7 @@ class Image:
     direction: tuple[tuple[float, ...], ...] = ()
     name: str = "image"
     pixel_type: str = "float32"
+    unit: str = "mm"
 
     def __post_init__(self) -> None:
         dim = self.grid.dim
@@ -47,6 +56,7 @@ class Image:
         object.__setattr__(self, "direction", tuple(tuple(map(float, r)) for r in self.direction) or identity)
         if len(self.origin) != dim or len(self.direction) != dim or {len(r) for r in self.direction} != {dim}:
             raise InputError(f"{self.name}: origin and direction must have {dim} axes like the image")
+        require_choice(self.unit, UNITS, f"{self.name}: unit")
         if not all(map(math.isfinite, self.origin)):
             raise InputError(f"{self.name}: its origin {self.origin} is not finite; correct the header of the file")
         if not abs(float(torch.linalg.det(torch.tensor(self.direction, dtype=torch.float64)))) > 1e-6:
@@ -64,6 +74,10 @@ class Image:
     def to(self, device: torch.device | str) -> "Image":
         """Return the same image with its pixels on ``device``."""
         return replace(self, data=self.data.to(device))
+
+    def in_unit(self, length: _Length) -> _Length:
+        """Return a length of the world, such as a spacing, in the image's `unit`."""
+        return length * UNITS[self.unit]
 
     def _rotation(self, like: Tensor) -> Tensor:
         return torch.tensor(self.direction, dtype=like.dtype, device=like.device)
@@ -182,8 +196,8 @@ def require_same_place(image: Image, other: Image, *, atol: float = 1e-3) -> Non
     apart = (image.to_world(ends) - other.to_world(ends)).norm(dim=1).max()
     if float(apart) > atol * min(other.grid.spacing):
         raise InputError(
-            f"{image.name} and {other.name} must lie in one place, but their headers put them {float(apart):.3g} mm "
-            "apart; correct origin, spacing or direction in one of them"
+            f"{image.name} and {other.name} must lie in one place, but their headers put them "
+            f"{image.in_unit(float(apart)):.3g} {image.unit} apart; correct origin, spacing or direction in one of them"
         )
 
 

@@ -51,6 +51,9 @@ FORMATS: dict[str, Format] = {
 # Pictures that ITK may refuse (for instance grey with alpha) but scikit-image reads. They have spacing 1 in ITK too.
 _PLAIN_PICTURES = (".png", ".gif", ".webp")
 
+# Files that have no spacing if ITK says 1.
+_PICTURES = (*_PLAIN_PICTURES, ".jpg", ".jpeg", ".bmp")
+
 # What the readers of ITK say about a file that is cut off, each in its own words.
 _DAMAGE_SIGNS = ("fread got only", "inflate", "Cannot read requested file", "unexpected end")
 
@@ -116,9 +119,10 @@ def _read_gzip(path: Path) -> Image:
 
 def _read_by_itk(path: Path) -> Image:
     try:
-        return itk.to_image(itk.load(path), str(path))
+        image = itk.to_image(itk.load(path), str(path))
     except RuntimeError as error:
         return _read_otherwise(path, itk.reason(error))
+    return replace(image, unit="px") if suffix(path) in _PICTURES and set(image.grid.spacing) == {1.0} else image
 
 
 def _read_otherwise(path: Path, reason: str) -> Image:
@@ -152,7 +156,7 @@ def _picture(values: NDArray[np.generic], name: str) -> Image:
     if pixels.shape[-1] == 2:
         pixels = pixels[..., [0, 0, 0, 1]]
     data = torch.from_numpy(np.moveaxis(pixels, -1, 0).astype(np.float32)).unsqueeze(0)
-    return Image(data, Grid(pixels.shape[:2]), name=name, pixel_type=values.dtype.name)
+    return Image(data, Grid(pixels.shape[:2]), name=name, pixel_type=values.dtype.name, unit="px")
 
 
 def write_image(image: Image, path: str | os.PathLike[str]) -> None:
@@ -173,7 +177,7 @@ def write_image(image: Image, path: str | os.PathLike[str]) -> None:
     pixels, paged = _stored(image, file), suffix(file) in (".tif", ".tiff") and image.grid.dim == 3
     if paged and pixels.dtype.name in _PAGED:
         with atomic_folder(file.parent) as folder:
-            write_tiff(pixels, image.grid.spacing, folder / file.name)
+            write_tiff(pixels, list(map(image.in_unit, image.grid.spacing)), image.unit, folder / file.name)
     else:
         itk.save(itk.from_values(pixels, image), file)
 

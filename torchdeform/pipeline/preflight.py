@@ -164,8 +164,9 @@ def _check_nodes(image: Image, severity: str) -> Iterator[Finding]:
 def _check_spacing(image: Image, partner: Image) -> Iterator[Finding]:
     least, most = _SPACINGS
     if min(image.grid.spacing) < least or max(image.grid.spacing) > most:
-        shown = "×".join(f"{h:.4g}" for h in image.grid.spacing[::-1])
-        yield Finding(WARNING, f"{image.name} has a spacing of {shown} mm; if that is not so, correct it in the header")
+        shown = "×".join(f"{image.in_unit(h):.4g}" for h in image.grid.spacing[::-1])
+        text = f"{image.name} has a spacing of {shown} {image.unit}; if that is not so, correct it in the header"
+        yield Finding(WARNING, text)
     if set(image.grid.spacing) == {1.0} and set(partner.grid.spacing) != {1.0}:
         text = (
             f"{image.name} has spacing 1 on all axes, as files without a spacing have, but {partner.name} has another"
@@ -196,7 +197,8 @@ def _has_contrast(image: Image, axis: int) -> Tensor:
 def _check_size(fixed: Image, moving: Image) -> Iterator[Finding]:
     sides = [math.prod(image.grid.extent) ** (1 / image.grid.dim) for image in (fixed, moving)]
     if max(sides) / min(sides) > _SIZE_RATIO:
-        sizes = f"{fixed.name} is {sides[0]:.4g} mm wide and {moving.name} {sides[1]:.4g} mm"
+        first, second = (f"{im.in_unit(side):.4g} {im.unit}" for im, side in zip((fixed, moving), sides, strict=True))
+        sizes = f"{fixed.name} is {first} wide and {moving.name} {second}"
         yield Finding(WARNING, f"{sizes}; check the spacings, or crop the larger one")
 
 
