@@ -106,7 +106,9 @@ def test_pixels_of_a_slice_without_spacing_are_no_millimetres(tmp_path):
     picture = sitk.GetImageFromArray(pixels(0)[None])
     sitk.WriteImage(picture, str(tmp_path / "a.dcm"))
     content = (tmp_path / "a.dcm").read_bytes()
-    (tmp_path / "b.dcm").write_bytes(content.replace(b"\x28\x00\x30\x00DS", b"\x28\x00\x30\x01DS"))
+    for group, element in ((b"\x28\x00", b"\x30\x00"), (b"\x18\x00", b"\x10\x20")):  # ITK has two tags for it
+        content = content.replace(group + element, group + b"\x39\x20")
+    (tmp_path / "b.dcm").write_bytes(content)
     assert [read_image(tmp_path / name).unit for name in ("a.dcm", "b.dcm")] == ["mm", "px"]
 
 
