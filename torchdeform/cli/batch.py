@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from torchdeform.cli.options import Quiet, flag, table
+from torchdeform.cli.options import Quiet, flag, say_written, table
 from torchdeform.cli.progress import CohortProgress, stoppable
 from torchdeform.cohort.estimate import Costs, estimate
 from torchdeform.cohort.plan import DESCRIPTION, Plan, description, plan
@@ -93,6 +93,7 @@ def schema(out: SchemaOut = None) -> None:
         return
     with atomic_folder(out.parent) as folder:
         (folder / out.name).write_text(text, encoding="utf-8")
+    say_written(out)
 
 
 def overview(work: Plan, costs: Costs) -> str:

@@ -17,9 +17,11 @@ from torchdeform.cli.options import (
     choice,
     flag,
     folds_text,
+    inverse_text,
     optional_file,
     print_json,
     table,
+    warn,
 )
 from torchdeform.cli.progress import StepProgress
 from torchdeform.io.files import stem
@@ -104,8 +106,8 @@ def register(
     if json:
         print_json({**outcome.record, "out": str(outcome.folder)})
     elif not quiet:
-        for warning in outcome.record["warnings"]:  # on stderr: standard output has the figures only
-            typer.echo(f"warning: {warning}", err=True)
+        for warning in outcome.record["warnings"]:
+            warn(warning)
         typer.echo(summary(outcome))
 
 
@@ -115,7 +117,7 @@ def summary(outcome: Outcome) -> str:
     lines = {
         f"similarity ({measure_name(r['similarity'])})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
         "folds": folds_text(r),
-        "inverse consistency": f"{r['inverse_error_mean']:.2g} voxel on average, {r['inverse_error_max']:.2g} at most",
+        "inverse consistency": inverse_text(r["inverse_error_mean"], r["inverse_error_max"]),
         **_measured(r),
         "seconds": f"{sum(r['seconds'].values()):.1f} on {r['device']}",
         "results": f"{outcome.folder}{os.sep} ({', '.join(r['files'])})",

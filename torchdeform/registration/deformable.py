@@ -12,6 +12,7 @@ from torchdeform.core.grid import Grid, limit_threads
 from torchdeform.core.image import Image, resample, same_place
 from torchdeform.core.intensities import require_finite
 from torchdeform.core.resampling import MIN_NODES, prolong
+from torchdeform.core.stages import begin
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import invert, warp
 from torchdeform.errors import ComputationError, InputError
@@ -163,6 +164,7 @@ def _register_images(
 
 def _align(fixed: Image, moving: Image, settings: RegistrationSettings, annotations: Annotations) -> Alignment:
     """Align as the settings say, with masks."""
+    begin("aligning")
     masks = (annotations.fixed_mask, annotations.moving_mask)
     first, second = (mask if isinstance(mask, Image) else None for mask in masks)
     return align(fixed, moving, fixed_mask=first, moving_mask=second, settings=settings.align)
@@ -211,6 +213,7 @@ def _optimise(
     if start is not None:
         start = _checked_start(start, problem)
     elif settings.start == "discrete":
+        begin("searching")
         start = discrete_start(
             problem.fixed, problem.moving, problem.grid, mask=problem.fixed_mask, settings=settings.discrete
         )
@@ -236,6 +239,7 @@ def _checked_start(start: Tensor, problem: RegistrationProblem) -> Tensor:
 
 def _result(found: _Optimised, grid: Grid, warped: Tensor, settings: RegistrationSettings) -> RegistrationResult:
     """Invert the map and measure it."""
+    begin("inverting")
     with limit_threads(len(found.u), grid):
         start = perf_counter()
         inverse = invert(found.u, grid)
