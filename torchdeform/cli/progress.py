@@ -79,7 +79,7 @@ class StepProgress(_Bar):
 
     def begin(self, stage: str) -> None:
         """Show the name of a stage, and how much of the work lies before it."""
-        self._progress.update(self._task, completed=_STAGES.get(stage), description=stage, detail="")
+        self._progress.update(self._task, completed=_STAGES.get(stage), description=stage, detail="", refresh=True)
 
     def show(self, step: Step) -> None:
         """Show one step of the optimisation. Every level is the same share of the bar."""

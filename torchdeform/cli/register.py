@@ -28,9 +28,11 @@ from torchdeform.io.files import stem
 from torchdeform.metrics.similarity import measure_name
 from torchdeform.pipeline.config import load_settings, parse_override, preset_names
 from torchdeform.pipeline.memory import parse_size
-from torchdeform.pipeline.register import REPORT, Outcome, PairFiles, register_files
+from torchdeform.pipeline.register import REPORT, REPORTS, Outcome, PairFiles, register_files
 from torchdeform.registration.affine.settings import ALIGNMENTS
 
+Report = Annotated[str, choice(REPORTS, "Pictures: {}; light has the middle slices only.", "KIND")]
+Overwrite = Annotated[bool, flag("--overwrite", "Replace results of another pair in the folder.")]
 Fixed = Annotated[
     Path,
     typer.Argument(metavar="FIXED", help="Image that stays: PNG, TIFF, NIfTI, NRRD, a DICOM folder ..."),
@@ -75,6 +77,8 @@ def register(
     assignments: Assignments = None,
     memory: Memory = None,
     device: Device = "auto",
+    report: Report = "full",
+    overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
     version: Version = False,
@@ -102,7 +106,9 @@ def register(
     )
     limit = None if memory is None else parse_size(memory)
     with StepProgress(quiet) as bar:
-        outcome = register_files(files, settings, device=device, memory=limit, callback=bar.show)
+        outcome = register_files(
+            files, settings, device=device, memory=limit, report=report, overwrite=overwrite, callback=bar.show
+        )
     if json:
         print_json({**outcome.record, "out": str(outcome.folder)})
     elif not quiet:
@@ -121,8 +127,9 @@ def summary(outcome: Outcome) -> str:
         **_measured(r),
         "seconds": f"{sum(r['seconds'].values()):.1f} on {r['device']}",
         "results": f"{outcome.folder}{os.sep} ({', '.join(r['files'])})",
-        "look at": str(outcome.folder / REPORT),
     }
+    if REPORT in r["files"]:
+        lines["look at"] = str(outcome.folder / REPORT)
     return table(lines)
 
 

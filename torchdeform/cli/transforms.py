@@ -229,7 +229,7 @@ def _inverse_error(inverse: Transform) -> tuple[float, float]:
 
 
 def _field_error(stage: Displacement) -> tuple[float, float]:
-    """Return mean and maximum of the distance, in voxels, of a field's nodes from where it and its inverse take them."""
+    """Return mean and maximum of how far, in voxels, a field and its inverse take the nodes from their places."""
     field, known = stage.field, stage.known_inverse
     if known is None:
         return 0.0, 0.0
