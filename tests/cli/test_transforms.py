@@ -13,7 +13,7 @@ import typer
 from torchdeform.cli import main as cli
 from torchdeform.cli import transforms
 from torchdeform.core.diagnostics import diagnose, inverse_error
-from torchdeform.core.image import Image
+from torchdeform.core.image import Image, surroundings
 from torchdeform.core.transform import Affine, Displacement, Transform
 from torchdeform.core.warp import invert
 from torchdeform.io import read_displacement, read_image, write_displacement, write_image
@@ -82,7 +82,7 @@ def _resampled(moving, fixed, transform, how):
 
 @pytest.mark.parametrize(("name", "how"), [("linear", sitk.sitkLinear), ("cubic", sitk.sitkBSpline)])
 def test_apply_is_itk_s_resampling(folder, name, how):
-    options = ["--out", "out/warped.nii.gz", "--interpolation", name]
+    options = ["--out", "out/warped.nii.gz", "--interpolation", name, "--outside", "0"]
     assert run("apply", "transform.h5", "moving.nrrd", "--reference", "fixed.nrrd", *options) == 0
     ours = sitk.ReadImage("out/warped.nii.gz")
     np.testing.assert_allclose(
@@ -117,10 +117,14 @@ def test_apply_takes_the_grid_of_the_transform(folder):
     np.testing.assert_allclose(*(sitk.GetArrayFromImage(sitk.ReadImage(f"{n}.nrrd")) for n in "ab"), atol=1e-3)
     assert run("apply", "transform.h5", "moving.nrrd", "--out", "c.nrrd", "--outside", "-5") == 0
     assert read_image("c.nrrd").data.min() == -5
+    beyond = read_image("c.nrrd").data == -5
+    surrounded = read_image("a.nrrd").data[beyond].unique()
+    assert surrounded.tolist() == surroundings(read_image("moving.nrrd")).tolist() != [0.0]
+    assert run("apply", "transform.h5", "moving.nrrd", "--out", "d.nrrd", "--outside", "black") == 2
 
 
 def test_apply_the_other_way(folder):
-    options = ["--reference", "moving.nrrd", "--inverse", "--out", "back.nrrd"]
+    options = ["--reference", "moving.nrrd", "--inverse", "--outside", "0", "--out", "back.nrrd"]
     assert run("apply", "transform.h5", "fixed.nrrd", *options) == 0
     assert run("invert", "transform.h5", "--out", "inverse.h5", "--quiet") == 0
     expected = _resampled("fixed.nrrd", "moving.nrrd", "inverse.h5", sitk.sitkLinear)
@@ -197,12 +201,14 @@ def test_jacobian(folder, capsys):
     torch.testing.assert_close(affine, torch.full_like(affine, 1.05**chain.dim))
 
 
-def test_a_picture_stays_one(tmp_path, monkeypatch, make_image, make_displacement):
+def test_a_picture_stays_one(tmp_path, monkeypatch, make_image, make_displacement, capsys):
     monkeypatch.chdir(tmp_path)
     picture = make_image((24, 30), channels=3, pixel_type="uint8")
     write_image(picture, "moving.png")
     write_transform(make_displacement(picture.grid, 0.1), picture, "t.h5")
     assert run("apply", "t.h5", "moving.png", "--out", "warped.png", "--interpolation", "cubic") == 0
+    assert run("apply", "t.h5", "moving.png", "--out", "w.png", "--outside", "-5") == 2
+    assert "moving.png is stored as uint8, which holds 0 to 255, so -5 does not fit" in capsys.readouterr().err
     warped = read_image("warped.png")
     assert (warped.pixel_type, tuple(warped.data.shape)) == ("uint8", (1, 3, 24, 30))
 

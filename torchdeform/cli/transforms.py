@@ -20,13 +20,21 @@ from torchdeform.cli.options import (
     warn,
 )
 from torchdeform.core.diagnostics import diagnose, inverse_error
-from torchdeform.core.image import Image, same_place
+from torchdeform.core.image import AUTO, Image, same_place
 from torchdeform.core.interpolation import COPYING, LABEL_MODE, MODES
 from torchdeform.core.transform import Displacement, Transform
 from torchdeform.core.warp import voxels
 from torchdeform.errors import InputError, require_choice
 from torchdeform.io.files import require_writable, suffix
-from torchdeform.io.images import FORMATS, read_image, read_labels, read_optional, write_image, write_labels
+from torchdeform.io.images import (
+    FORMATS,
+    read_image,
+    read_labels,
+    read_optional,
+    require_storable,
+    write_image,
+    write_labels,
+)
 from torchdeform.io.points import read_points, require_points_file, write_points
 from torchdeform.io.transforms import read_transform, require_transform_file, write_transform
 from torchdeform.pipeline.preflight import looks_like_labels
@@ -66,7 +74,9 @@ FieldGrid = Annotated[
 ]
 Interpolation = Annotated[str, choice(MODES, "{}; label or nearest keep values and their type.")]
 Inverse = Annotated[bool, flag("--inverse", "Use the inverse of TRANSFORM.")]
-Outside = Annotated[float, typer.Option(metavar="VALUE", help="Value where MOVING does not reach.")]
+Outside = Annotated[
+    str, typer.Option(metavar="VALUE", help="Value where MOVING does not reach; auto: what surrounds it, 0 for labels.")
+]
 
 
 def apply(
@@ -76,7 +86,7 @@ def apply(
     reference: Reference = None,
     interpolation: Interpolation = "linear",
     inverse: Inverse = False,
-    outside: Outside = 0.0,
+    outside: Outside = AUTO,
     quiet: Quiet = False,
 ) -> None:
     """Warp the MOVING image onto the grid of the fixed image: result(x) = MOVING(TRANSFORM(x)).
@@ -86,13 +96,14 @@ def apply(
     """
     require_choice(interpolation, MODES, "--interpolation")
     _require_image_output(out, transform, moving, reference)
-    labels = interpolation in COPYING
+    labels, beyond = interpolation in COPYING, _outside(outside)
     chain = _read(transform, inverse)
     place = _place(chain, reference, transform)
     image = read_labels(moving) if labels else read_image(moving)
     if not labels and looks_like_labels(image):
         warn(f"{moving} looks like labels, which {interpolation} interpolation mixes; use --interpolation {LABEL_MODE}")
-    result = chain.image(image, place, mode=interpolation, outside=outside)
+    require_storable(beyond, suffix(out), image, labels=labels)
+    result = chain.image(image, place, mode=interpolation, outside=beyond)
     (write_labels if labels else write_image)(result, out)
     say_written(out, quiet=quiet)
 
@@ -192,6 +203,16 @@ def _place(chain: Transform, reference: Path | None, path: Path) -> Image | None
     if reference is None and chain.reference is None:
         raise InputError(f"{path} has no grid for the result; give --reference IMAGE")
     return read_optional(reference)
+
+
+def _outside(text: str) -> float | str:
+    """Return the number that a text holds, or ``auto``."""
+    if text == AUTO:
+        return text
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"--outside needs a number or auto, got {text!r}") from error
 
 
 def _on_grid(chain: Transform, reference: Path | None) -> Transform:

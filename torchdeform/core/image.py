@@ -87,8 +87,17 @@ class Image:
         return origin.view(1, -1, *([1] * (like.dim() - 2)))  # points may come as a list as well as on a grid
 
 
+# Outside of an image: a number, None for the nearest value inside, or this for what `surroundings` finds.
+AUTO = "auto"
+
+# What surrounds an image is the median of its faces if most of them, this share, are near it: closer than this share of
+# the range between its dark and bright ends, these quantiles. Fewer pixels may mark what a scanner cannot see.
+_MOSTLY, _NEAR, _ENDS = 0.5, 0.05, (0.05, 0.95)
+_SOME = 2**20  # pixels of which quantiles are taken
+
+
 def resample(
-    moving: Image, fixed: Image, u: Tensor | None = None, *, mode: str = "linear", outside: float | None = 0.0
+    moving: Image, fixed: Image, u: Tensor | None = None, *, mode: str = "linear", outside: float | str | None = 0.0
 ) -> Tensor:
     """Return moving(φ(x)) at the nodes x of ``fixed``, both taken in their physical place.
 
@@ -98,7 +107,8 @@ def resample(
         u: displacement ``(1, D, *S)`` on the fixed grid (array order, units of spacing) of φ = id + u; zero when
             None.
         mode: ``linear`` or ``nearest``.
-        outside: value outside the moving image (ITK's resampler uses 0); None continues its edge.
+        outside: value outside the moving image (ITK's resampler uses 0); None continues its edge, ``auto`` takes what
+            `surroundings` says.
 
     Returns:
         ``(1, C, *S)`` on the fixed grid; the moving pixels themselves where both images have one grid and one place.
@@ -109,13 +119,47 @@ def resample(
     if u is None and same_place(moving, fixed):
         return moving.data
     grid, device = fixed.grid, moving.data.device
+    beyond = outside_value(moving, outside)
 
     def values(rows: slice) -> Tensor:
         points = grid.points(dtype=torch.float64, device=device, rows=rows)
         points = points if u is None else points + u[:, :, rows]
-        return sample(moving.data, moving.to_grid(fixed.to_world(points)), moving.grid, mode=mode, outside=outside)
+        return sample(moving.data, moving.to_grid(fixed.to_world(points)), moving.grid, mode=mode, outside=beyond)
 
     return over_slabs(values, grid.shape, device)
+
+
+def outside_value(image: Image, outside: float | str | None) -> float | Tensor | None:
+    """Return the value outside of an image that a number, None or ``auto`` stands for.
+
+    Raises:
+        InputError: another word.
+    """
+    if not isinstance(outside, str):
+        return outside
+    require_choice(outside, (AUTO,), f"{image.name}: outside, if it is no number,")
+    return surroundings(image)
+
+
+def surroundings(image: Image) -> Tensor:
+    """Return what surrounds an image, such as air or paper, for each channel ``(C,)``.
+
+    Args:
+        image: pixels that are not finite do not count.
+
+    Notes:
+        The median of the image's faces if most of them are close to it in all channels, else its dark end, below which
+        are 5 % of the pixels. Either is a value that occurs in the image, so its type can hold it.
+    """
+    data, flat = image.data, image.data.flatten(2)
+    faces = torch.cat([data.select(axis, end).flatten(2) for axis in range(2, data.dim()) for end in (0, -1)], dim=2)
+    some = flat[..., :: 1 + flat.shape[2] // _SOME]
+    faces, some = (torch.where(part.isfinite(), part, torch.nan) for part in (faces, some))
+    low, high = some.nanquantile(torch.tensor(_ENDS).to(flat), dim=2, interpolation="lower")
+    middle = faces.nanmedian(dim=2).values
+    near = ((faces - middle.unsqueeze(2)).abs() <= _NEAR * (high - low).unsqueeze(2)).all(1)
+    found = middle if float(near[faces.isfinite().all(1)].double().mean()) > _MOSTLY else low
+    return found[0].nan_to_num(0.0, 0.0, 0.0)
 
 
 def same_place(a: Image, b: Image) -> bool:

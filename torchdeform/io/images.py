@@ -7,6 +7,7 @@ import tempfile
 import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -190,13 +191,30 @@ def _stored(image: Image, path: Path) -> NDArray[np.generic]:
     if not can_hold(ending, image):
         what = f"{image.grid.dim}D {image.pixel_type} images of {image.data.shape[1]} channels"
         raise InputError(f"{path}: {ending} files cannot hold {what}; use .tif or .nii.gz")
-    types = FORMATS[ending].types
-    kind = np.dtype(image.pixel_type if image.pixel_type in types else types[-1])
-    values = image.data[0].detach().cpu().numpy()
+    kind, values = _stored_type(ending, image), image.data[0].detach().cpu().numpy()
     if kind.kind == "f":
         return values.astype(kind)
     limits = np.iinfo(kind)
     return np.rint(values).clip(limits.min, limits.max).astype(kind)
+
+
+def _stored_type(ending: str, image: Image) -> np.dtype[Any]:
+    """Return the type in which files of this ending store the image."""
+    types = FORMATS[ending].types
+    return np.dtype(image.pixel_type if image.pixel_type in types else types[-1])
+
+
+def require_storable(value: float | str, ending: str, image: Image, *, labels: bool = False) -> None:
+    """Raise `InputError` unless a value outside of the image fits into files of this ending; words always do."""
+    kind: np.dtype[Any] = np.dtype(image.pixel_type) if labels else _stored_type(ending, image)
+    if isinstance(value, str) or kind.kind == "f":
+        return
+    limits = np.iinfo(kind)
+    if not limits.min <= value <= limits.max:
+        raise InputError(
+            f"outside: {image.name} is stored as {kind}, which holds {limits.min} to {limits.max}, so {value:g} does "
+            "not fit; choose another value, or auto"
+        )
 
 
 def can_hold(ending: str, image: Image) -> bool:

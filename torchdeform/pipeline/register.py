@@ -16,7 +16,7 @@ from torchdeform.core.transform import Transform
 from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.io import read_image, write_displacement, write_image, write_transform
 from torchdeform.io.files import atomic_folder, require_writable
-from torchdeform.io.images import ending_like, read_labels, read_optional, write_labels
+from torchdeform.io.images import ending_like, read_labels, read_optional, require_storable, write_labels
 from torchdeform.io.points import matched, read_points
 from torchdeform.metrics.evaluation import common_labels
 from torchdeform.pipeline.memory import available, fitting_grid, footprint, peak, readable
@@ -140,6 +140,7 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
         memory=memory,
     )
     report.require_ok()
+    require_storable(settings.outside, ending_like(files.moving, moving), moving)
     labels = [None if path is None else read_labels(path) for path in (files.fixed_labels, files.moving_labels)]
     annotations = Annotations(
         fixed_mask=masks[0],

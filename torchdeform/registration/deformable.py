@@ -151,7 +151,7 @@ def _register_images(
     space = _midspace(*both, problem, affine, settings) if settings.symmetric else None
     found = _optimise(problem, space, settings, start, callback)
     del problem, space
-    warped = _warped(fixed, moving, affine, found.u)
+    warped = _warped(fixed, moving, affine, found.u, settings)
     result = _result(found, fixed.grid, warped, settings)
     return replace(
         result,
@@ -184,10 +184,10 @@ def _midspace(
     return replace(space, problem=space.problem.scaled(settings))
 
 
-def _warped(fixed: Image, moving: Image, affine: Affine | None, u: Tensor) -> Tensor:
+def _warped(fixed: Image, moving: Image, affine: Affine | None, u: Tensor, settings: RegistrationSettings) -> Tensor:
     """Return the moving image on the fixed grid, sampled once."""
     seen = moving if affine is None else moved(moving, affine.inverse())
-    return resample(seen, fixed, u).to(moving.data.dtype)
+    return resample(seen, fixed, u, outside=settings.outside).to(moving.data.dtype)
 
 
 @dataclass(frozen=True)
@@ -293,7 +293,7 @@ def resample_result(
         displacement=u,
         inverse=inverse,
         grid=grid,
-        warped=_warped(fixed, moving, result.affine, u),
+        warped=_warped(fixed, moving, result.affine, u, result.settings),
         diagnosis=diagnose(u, grid),
         inverse_error_mean=mean,
         inverse_error_max=largest,
