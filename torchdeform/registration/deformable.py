@@ -12,6 +12,7 @@ from torchdeform.core.grid import Grid, limit_threads
 from torchdeform.core.image import Image, resample, same_place
 from torchdeform.core.intensities import require_finite
 from torchdeform.core.resampling import MIN_NODES, prolong
+from torchdeform.core.stages import begin
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import invert, warp
 from torchdeform.errors import ComputationError, InputError
@@ -148,8 +149,13 @@ def _register_images(
     space = _midspace(*both, problem, affine, settings) if settings.symmetric else None
     found = _optimise(problem, space, settings, start, callback)
     del problem, space
+<<<<<<< HEAD
     warped = _warped(fixed, moving, affine, found.u)
     alignment, result = placed.alignment, _result(found, fixed.grid, warped, settings)
+=======
+    warped = _warped(fixed, moving, affine, found.u, settings)
+    result = _result(found, fixed.grid, warped, settings)
+>>>>>>> wtS
     return replace(
         result,
         affine=affine,
@@ -162,6 +168,17 @@ def _register_images(
     )
 
 
+<<<<<<< HEAD
+=======
+def _align(fixed: Image, moving: Image, settings: RegistrationSettings, annotations: Annotations) -> Alignment:
+    """Align as the settings say, with masks."""
+    begin("aligning")
+    masks = (annotations.fixed_mask, annotations.moving_mask)
+    first, second = (mask if isinstance(mask, Image) else None for mask in masks)
+    return align(fixed, moving, fixed_mask=first, moving_mask=second, settings=settings.align)
+
+
+>>>>>>> wtS
 def _midspace(
     fixed: PlacedImage,
     moving: PlacedImage,
@@ -176,10 +193,10 @@ def _midspace(
     return replace(space, problem=space.problem.scaled(settings))
 
 
-def _warped(fixed: Image, moving: Image, affine: Affine | None, u: Tensor) -> Tensor:
+def _warped(fixed: Image, moving: Image, affine: Affine | None, u: Tensor, settings: RegistrationSettings) -> Tensor:
     """Return the moving image on the fixed grid, sampled once."""
     seen = moving if affine is None else moved(moving, affine.inverse())
-    return resample(seen, fixed, u).to(moving.data.dtype)
+    return resample(seen, fixed, u, outside=settings.outside).to(moving.data.dtype)
 
 
 @dataclass(frozen=True)
@@ -204,7 +221,12 @@ def _optimise(
     began = perf_counter()
     if start is not None:
         start = _checked_start(start, problem)
+<<<<<<< HEAD
     elif settings.starts_discretely:
+=======
+    elif settings.start == "discrete":
+        begin("searching")
+>>>>>>> wtS
         start = discrete_start(
             problem.fixed, problem.moving, problem.grid, mask=problem.fixed_mask, settings=settings.discrete
         )
@@ -241,6 +263,7 @@ def _checked_start(start: Tensor, problem: RegistrationProblem) -> Tensor:
 
 def _result(found: _Optimised, grid: Grid, warped: Tensor, settings: RegistrationSettings) -> RegistrationResult:
     """Invert the map and measure it."""
+    begin("inverting")
     with limit_threads(len(found.u), grid):
         start = perf_counter()
         inverse = invert(found.u, grid)
@@ -296,7 +319,7 @@ def resample_result(
         displacement=u,
         inverse=inverse,
         grid=grid,
-        warped=_warped(fixed, moving, result.affine, u),
+        warped=_warped(fixed, moving, result.affine, u, result.settings),
         diagnosis=diagnose(u, grid),
         inverse_error_mean=mean,
         inverse_error_max=largest,
