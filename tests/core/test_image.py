@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image, luminance, overlap, require_registrable, resample
+from torchdeform.core.image import (
+    Image,
+    is_oblique,
+    luminance,
+    orientation,
+    overlap,
+    require_registrable,
+    resample,
+)
 from torchdeform.errors import InputError
 
 
@@ -109,3 +117,22 @@ def test_device_is_moved():
     image = Image(torch.zeros(1, 1, 4, 4), Grid((4, 4)), (1.0, 2.0), name="slice")
     moved = image.to("meta")
     assert (moved.data.device.type, moved.origin, moved.name) == ("meta", (1.0, 2.0), "slice")
+
+
+@pytest.mark.parametrize(
+    ("direction", "letters", "oblique"),
+    [
+        (((1, 0, 0), (0, 1, 0), (0, 0, 1)), "LPS", False),
+        (((-1, 0, 0), (0, -1, 0), (0, 0, 1)), "RAS", False),
+        (((-1, 0, 0), (0, -1, 0), (0, 0, -1)), "RAI", False),
+        (((0, 0, -1), (1, 0, 0), (0, 1, 0)), "PSR", False),
+        (((0, 0, 1), (-1, 0, 0), (0, -1, 0)), "AIL", False),
+        (((0.936, -0.275, 0.218), (0.29, 0.956, -0.037), (-0.199, 0.098, 0.975)), "LPS", True),
+        (((0, 1), (-1, 0)), "AL", False),
+        (((0.8, -0.6), (0.6, 0.8)), "LP", True),
+    ],
+)
+def test_orientation_codes(direction, letters, oblique):
+    dim = len(direction)
+    image = Image(torch.rand(1, 1, *[3] * dim), Grid((3,) * dim), direction=direction)
+    assert (orientation(image), is_oblique(image)) == (letters, oblique)

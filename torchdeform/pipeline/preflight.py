@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import permutations, product
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -30,9 +30,6 @@ _FILLED = 0.5  # share of the image without its empty margins
 _FITS = 0.6  # correlation that a flipped image must reach
 _BETTER = 0.25  # and it must be this much better than the image as it is, or this share closer to 1
 _BLOCKS = {2: 48, 3: 24}  # blocks along an axis of the images that are flipped
-
-# Letters of the world axes x, y, z: what their positive and negative directions point to.
-_LETTERS = ("LR", "PA", "SI")
 
 
 @dataclass(frozen=True)
@@ -120,25 +117,6 @@ def preflight(
         found += [] if mask is None else _check_mask(image, mask)
     order = (ERROR, WARNING, NOTE)
     return Report(tuple(sorted(found, key=lambda finding: order.index(finding.severity))))
-
-
-def orientation(image: Image) -> str:
-    """Return what the x, y and z index axes point to, as ``LPS`` (left, posterior, superior) or ``RAI``.
-
-    Args:
-        image: 2D or 3D.
-
-    Notes:
-        An oblique axis gets the nearest direction. No two axes get the same pair of letters.
-    """
-    along = permutations(range(image.grid.dim))
-    best = max(along, key=lambda axes: sum(abs(image.direction[world][k]) for k, world in enumerate(axes)))
-    return "".join(_LETTERS[world][int(image.direction[world][k] < 0)] for k, world in enumerate(best))
-
-
-def is_oblique(image: Image) -> bool:
-    """Return whether an axis deviates from the world axes by more than about one degree."""
-    return any(max(abs(row[k]) for row in image.direction) < math.cos(0.02) for k in range(image.grid.dim))
 
 
 def _check_values(image: Image) -> Iterator[Finding]:
