@@ -239,7 +239,7 @@ def _write_results(files: PairFiles, inputs: Inputs, result: RegistrationResult,
     with atomic_folder(out) as folder:
         _write_images(folder, files, inputs, result)
         written = perf_counter()
-        data = make_report_data(inputs.fixed, inputs.moving, result)
+        data = make_report_data(inputs.fixed, inputs.moving, result, annotations=inputs.annotations)
         write_overview(folder / "overview.png", data)
         names = (*sorted([*(path.name for path in folder.iterdir()), REPORT]), RECORD)
         run.seconds.update(result.seconds, write=written - start, draw=perf_counter() - written)
