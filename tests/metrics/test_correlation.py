@@ -1,13 +1,14 @@
 """Correlations: numpy's own, and a loop over windows."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 import torch
 from metric_images import SHAPES, UNIT, images, smooth, soft_mask
 
-from torchdeform.metrics.correlation import LNCC_FLOOR, LocalCrossCorrelation, lncc, ncc
+from torchdeform.metrics.correlation import LNCC_CONTRAST, LNCC_FLOOR, LocalCrossCorrelation, lncc, ncc
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -49,14 +50,16 @@ def test_lncc_is_a_loop_over_windows(shape, masked):
     fixed, warped = images(shape, items=1)
     weight = soft_mask(shape, items=1) if masked else torch.ones(1, 1, *shape, dtype=torch.float64)
     f, w, m = (x[0, 0].numpy() for x in (fixed, warped, weight))
-    total = 0.0
+    total = count = 0.0
     for node in itertools.product(*map(range, shape)):
         cut = tuple(slice(max(0, i - 1), i + 2) for i in node)
         if m[node] > 0:
             c = np.cov(f[cut].ravel(), w[cut].ravel(), aweights=m[cut].ravel(), ddof=0)
-            total += m[node] * c[0, 1] ** 2 / ((c[0, 0] + LNCC_FLOOR) * (c[1, 1] + LNCC_FLOOR))
+            variance = [c[k, k] + LNCC_FLOOR for k in range(2)]
+            t = m[node] * c[0, 0] ** 2 / (c[0, 0] ** 2 + LNCC_CONTRAST**4)
+            total, count = total + t * (abs(c[0, 1]) + LNCC_FLOOR) ** 2 / math.prod(variance), count + t
     found = lncc(fixed, warped, mask=weight if masked else None, window=3, intensity_range=UNIT)
-    assert found.item() == pytest.approx(total / m.sum(), rel=1e-9)
+    assert found.item() == pytest.approx(total / count, rel=1e-9)
 
 
 def test_lncc_of_tiny_and_of_huge_intensities():
@@ -74,3 +77,33 @@ def test_a_window_that_the_mask_hardly_touches():
     assert value.isfinite().all()
     assert slope.isfinite().all()
     assert slope[..., 3, 4].abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("shape", [(40, 44), (18, 20, 16)])
+def test_lncc_of_an_image_with_itself_is_1_and_cannot_be_raised(shape):
+    """Half of the picture is flat but for noise below a grey level: nothing is gained by enlarging it."""
+    noise = torch.rand(1, 1, *shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    shown = (torch.arange(shape[0]) < shape[0] // 2).view(-1, *[1] * (len(shape) - 1))
+    fixed = smooth(shape) * shown + 0.004 * noise
+    value, slope = LocalCrossCorrelation(fixed, 5, 2).evaluate(fixed)
+    assert value.item() == pytest.approx(1, abs=1e-12)
+    assert slope.abs().max() < 1e-9
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (20, 20, 20)])
+def test_lncc_of_white_noise_is_about_the_number_of_voxels_in_a_window(shape):
+    first, second = torch.rand(2, 1, 1, *shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    assert lncc(first, second, window=9).item() == pytest.approx(1 / (9 ** len(shape) - 1), rel=0.4)
+
+
+def test_lncc_looks_only_where_the_fixed_image_has_contrast():
+    """Half of the fixed image is flat: what the other one shows there changes nothing."""
+    shape = (40, 60)
+    fixed, warped = (smooth(shape, seed=seed) for seed in (0, 3))
+    fixed[..., 30:] = 0.3
+    near = fixed.new_ones(1, 1, *shape)
+    near[..., 35:] = 0  # windows of 5 that touch the other half
+    whole, half = (lncc(fixed, warped, mask=mask, window=5, intensity_range=UNIT) for mask in (None, near))
+    changed = torch.where(near > 0, warped, warped.flip(2))
+    assert lncc(fixed, changed, window=5, intensity_range=UNIT).item() == pytest.approx(whole.item(), rel=1e-6)
+    assert half.item() == pytest.approx(whole.item(), rel=1e-6)

@@ -6,6 +6,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from torchdeform.core.grid import per_item
 from torchdeform.core.resampling import box_sum, box_sum_transpose, centres
 from torchdeform.metrics.base import (
     IntensityRange,
@@ -18,11 +19,18 @@ from torchdeform.metrics.base import (
     weighted,
 )
 
-# Added to both variances of LNCC, for images scaled to [0, 1]: windows flatter than a grey level of 0.3 % are flat.
+# Added to the covariance and to both variances of LNCC, as if both images had one more texture in common, for images
+# scaled to [0, 1]: windows flatter than a grey level of 0.3 % agree.
 LNCC_FLOOR = 1e-5
+
+# Windows of the fixed image with this standard deviation have weight 1/2 in LNCC; its intensities are scaled to [0, 1].
+LNCC_CONTRAST = 0.01
 
 # Added to both variances of NCC: images flatter than a grey level of 0.01 % are flat.
 NCC_FLOOR = 1e-8
+
+# An image whose windows weigh less than this on average is flat: its variances are rounding.
+_FLAT = 1e-5
 
 # A window with less weight than this is empty. Its square root is far from float32's smallest number.
 _EMPTY = 1e-20
@@ -93,21 +101,24 @@ class _Windows:
 
     Attributes:
         weight: of the voxels ``(B or 1, 1, *S)``, 1 on average; None for 1 everywhere.
-        window_weight: of a window, that of the voxel in its middle, 1 on average; None for 1 everywhere.
+        window_weight: of a window: its `contrast` in the fixed image, times the weight of the voxel in its middle; 1 on
+            average.
         inverse_count: 1 / weight of its voxels.
         mean: of the fixed image in it.
         variance: of the fixed image in it, + ε.
     """
 
     weight: Tensor | None
-    window_weight: Tensor | None
+    window_weight: Tensor
     inverse_count: Tensor
     mean: Tensor
     variance: Tensor
 
 
 class LocalCrossCorrelation(Similarity):
-    """S = mean over x of c² / ((v_f + ε)(v_w + ε)), covariance and variances in the window around x.
+    """S = mean over x of t (|c| + ε)² / ((v_f + ε)(v_w + ε)), covariance and variances in the window around x.
+
+    The weight t = v_f² / (v_f² + τ⁴), 1 on average, leaves out what has no contrast in the fixed image.
 
     Args:
         fixed: ``(B, C, *S)``, scaled to about [0, 1].
@@ -115,9 +126,10 @@ class LocalCrossCorrelation(Similarity):
         stride: voxels from one x to the next along every axis.
 
     Notes:
-        Lies in [0, 1]. With a = 2c/((v_f + ε)(v_w + ε)), b = a c/(v_w + ε) and E the mean over a window, the
-        derivative by warped(y) is Σ [a (fixed(y) − E fixed) − b (warped(y) − E warped)] over the windows that hold y,
-        each divided by its number of voxels. ε = 1e-5 keeps flat regions finite: they count as not correlated.
+        Lies in [0, 1], and is 1 for equal images, where the derivative is 0: with ε in the variances alone, noise in
+        flat regions would be enlarged for ever. With k = c + ε sgn c, a = 2 t k/((v_f + ε)(v_w + ε)), b = a k/(v_w + ε)
+        and E the mean over a window, the derivative by warped(y) is the sum over the windows that hold y of
+        a (fixed(y) − E fixed) − b (warped(y) − E warped), divided by their numbers of voxels. ε = 1e-5, τ = 0.01.
         A mask weights the voxels of a window and the windows: E becomes the weighted mean.
         Box sums of 3 fields and the transpose of 3 a call; 3 more for a mask that is not the one of the call before.
         With stride 3, as in `register` with windows of 9, there are 27 times fewer windows in 3D, and maps are as good.
@@ -143,9 +155,9 @@ class LocalCrossCorrelation(Similarity):
         sums = box_sum(_products(warped, self.fixed, windows.weight), self.window, self.stride)
         sums.mul_(windows.inverse_count)
         warped_mean, square, product = sums.chunk(3, dim=1)
-        covariance = product.addcmul_(warped_mean, windows.mean, value=-1)
+        covariance = _raised(product.addcmul_(warped_mean, windows.mean, value=-1))
         variance = square.addcmul_(warped_mean, warped_mean, value=-1).clamp_(min=0).add_(LNCC_FLOOR)
-        correlation = weighted(covariance / (variance * windows.variance), windows.window_weight)
+        correlation = (covariance / (variance * windows.variance)).mul_(windows.window_weight)
         value = mean(correlation * covariance)
         a = correlation.mul_(windows.inverse_count * (2 * warped[0, 0].numel() / correlation[0, 0].numel()))
         b = a * covariance / variance
@@ -164,19 +176,21 @@ def lncc(
     intensity_range: IntensityRange = None,
     stride: int = 1,
 ) -> Tensor:
-    """Return S = mean over x of c² / ((v_f + ε)(v_w + ε)), covariance and variances in the window around x.
+    """Return S = mean over x of t (|c| + ε)² / ((v_f + ε)(v_w + ε)), covariance and variances in the window around x.
+
+    The weight t = v_f² / (v_f² + τ⁴), 1 on average, leaves out what has no contrast in the fixed image.
 
     Args:
         fixed: ``(B, C, *S)``, any unit.
         warped: the same shape, any unit.
         mask: weight of each voxel ``(B, 1, *S)``, 0 to 1, in the windows and of the windows; all ones when None.
         window: width in voxels, odd. At the boundary the part of the window inside the image counts.
-        intensity_range: intensities taken for 0 and 1, which gives ε = 1e-5 its meaning; None: the smallest and the
-            largest of each image where the mask is positive.
+        intensity_range: intensities taken for 0 and 1, which gives ε = 1e-5 and τ = 0.01 their meaning; None: the
+            smallest and the largest of each image where the mask is positive.
         stride: voxels from one x to the next along every axis.
 
     Returns:
-        ``(B,)`` between 0 and 1. Flat windows give 0.
+        ``(B,)`` between 0 and 1: 1 for equal images, about 1 / (voxels of a window − 1) for white noise.
 
     Raises:
         InputError: shapes.
@@ -188,15 +202,29 @@ def lncc(
     windows = _windows(fixed, relative_weight(mask, warped), window, stride)
     warped_mean, variance = _moments(warped, windows.weight, windows.inverse_count, window, stride)
     product = box_sum(weighted(fixed * warped, windows.weight), window, stride) * windows.inverse_count
-    covariance = product - windows.mean * warped_mean
+    covariance = _raised(product - windows.mean * warped_mean)
     return mean(covariance.square() / (windows.variance * variance), windows.window_weight)
 
 
 def _windows(fixed: Tensor, weight: Tensor | None, window: int, stride: int) -> _Windows:
     ones = fixed.new_ones(1, 1, *fixed.shape[2:]) if weight is None else weight
     inverse_count = 1 / box_sum(ones, window, stride).clamp(min=_EMPTY)
-    window_weight = None if weight is None else relative_weight(middle := centres(weight, stride), middle)
-    return _Windows(weight, window_weight, inverse_count, *_moments(fixed, weight, inverse_count, window, stride))
+    middle, variance = _moments(fixed, weight, inverse_count, window, stride)
+    counted = contrast((variance - LNCC_FLOOR).clamp(min=0))
+    counted = counted if weight is None else counted * centres(weight, stride)
+    counted = counted / per_item(counted.flatten(1).mean(1).clamp(min=_FLAT), counted)
+    return _Windows(weight, counted, inverse_count, middle, variance)
+
+
+def _raised(covariance: Tensor) -> Tensor:
+    """Return c + ε sgn c: reversed contrast is as good."""
+    return covariance + torch.full_like(covariance, LNCC_FLOOR).copysign(covariance)
+
+
+def contrast(variance: Tensor) -> Tensor:
+    """Return the weight v² / (v² + τ⁴) of windows with variance v in an image scaled to about [0, 1]."""
+    square = variance.square()
+    return square / (square + LNCC_CONTRAST**4)
 
 
 def _moments(
@@ -222,25 +250,21 @@ def _products(warped: Tensor, fixed: Tensor, weight: Tensor | None) -> Tensor:
     return fields
 
 
-# Windows of this standard deviation have weight 1/2 in `ForegroundLNCC`; the image's range is 1.
-_FOREGROUND = 0.01
-
-# Images are multiplied by this, so that ε of LNCC is small against the square of that deviation.
+# Images are multiplied by this in `ForegroundLNCC`, so that ε is small against τ² and hardly a window is flat.
 _GAIN = 10.0
 
 
 class ForegroundLNCC(Similarity):
-    """S = mean of LNCC over x, weighted by t(x) = v² / (v² + τ⁴), v being the variance of the fixed image around x.
+    """LNCC whose voxels, not only its windows, are weighted by t = v² / (v² + τ⁴), v being the variance around them.
 
     Args:
         fixed: ``(B, C, *S)``, scaled to about [0, 1].
         window: width in voxels, odd.
 
     Notes:
-        LNCC adds ε to both variances, so a flat window counts as not correlated. A map that enlarges the moving image
-        until it covers the background then raises LNCC. With t, and with ε small against τ², S is 1 for images that
-        agree, and the best map is the true one: the map of blobs of 10 voxels on an empty background was up to 5 voxels
-        off with LNCC, and is less than 0.1 off with this.
+        The background counts neither as a window nor in one. The map of blobs of 10 voxels on an empty background was
+        up to 5 voxels off when flat windows counted as not correlated, since a map that enlarges the moving image until
+        it covers the background then raises S; it is less than 0.1 off with this.
     """
 
     def __init__(self, fixed: Tensor, window: int) -> None:
@@ -249,7 +273,7 @@ class ForegroundLNCC(Similarity):
         count = box_sum(ones, window)
         mean = box_sum(fixed, window) / count
         variance = (box_sum(fixed * fixed, window) / count - mean * mean).clamp(min=0).amax(1, keepdim=True)
-        self.foreground = variance**2 / (variance**2 + _FOREGROUND**4)
+        self.foreground = contrast(variance)
 
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         weight = self.foreground.expand(len(warped), *self.foreground.shape[1:])
