@@ -275,9 +275,10 @@ def _draw(folder: Path, inputs: Inputs, result: RegistrationResult, report: str)
     """Draw the pictures of a report, and return its data; None if there is none."""
     if report == "none":
         return None
-    data = make_report_data(inputs.fixed, inputs.moving, result, **({"slices": 1} if report == "light" else {}))
+    light, annotations = report == "light", inputs.annotations
+    data = make_report_data(inputs.fixed, inputs.moving, result, annotations=annotations, light=light)
     write_overview(folder / OVERVIEW, data)
-    if report == "light":
+    if light:
         write_thumbnail(folder / THUMBNAIL, data)
     return data
 

@@ -77,9 +77,10 @@ def register(
         One step: force = N ∂S/∂warped ∇warped; K v = M force + load of a divergence where the map is nearly folded, K
         being the div-curl least squares with w_d, w_c and w_0 = w_d / length²; φ ← φ ∘ flow(v), the longest move being
         ``step_length`` voxels, less where a one-sided determinant would fall below ``min_determinant``. A level keeps
-        its most similar map. Items of a batch do not influence each other. Liu, Liao & Xue 2007, section 2, with the
-        controls driven by the images. The result is never less similar than its start, over the same voxels. Landmarks add the force of their squared distance at the points. With
-        ``symmetric`` two maps from a space between move against each other, and φ = φ_m ∘ φ_f⁻¹.
+        its most similar map, and the result is never less similar than its start, over the same voxels. Items of a
+        batch do not influence each other. Liu, Liao & Xue 2007, section 2, with the controls driven by the images.
+        Landmarks add the force of their squared distance at the points. With ``symmetric`` two maps from a space
+        between move against each other, and φ = φ_m ∘ φ_f⁻¹.
     """
     settings, annotations = config or RegistrationSettings(), annotations or Annotations()
     if isinstance(fixed, Image) and isinstance(moving, Image):
@@ -149,13 +150,8 @@ def _register_images(
     space = _midspace(*both, problem, affine, settings) if settings.symmetric else None
     found = _optimise(problem, space, settings, start, callback)
     del problem, space
-<<<<<<< HEAD
-    warped = _warped(fixed, moving, affine, found.u)
-    alignment, result = placed.alignment, _result(found, fixed.grid, warped, settings)
-=======
     warped = _warped(fixed, moving, affine, found.u, settings)
-    result = _result(found, fixed.grid, warped, settings)
->>>>>>> wtS
+    alignment, result = placed.alignment, _result(found, fixed.grid, warped, settings)
     return replace(
         result,
         affine=affine,
@@ -168,17 +164,6 @@ def _register_images(
     )
 
 
-<<<<<<< HEAD
-=======
-def _align(fixed: Image, moving: Image, settings: RegistrationSettings, annotations: Annotations) -> Alignment:
-    """Align as the settings say, with masks."""
-    begin("aligning")
-    masks = (annotations.fixed_mask, annotations.moving_mask)
-    first, second = (mask if isinstance(mask, Image) else None for mask in masks)
-    return align(fixed, moving, fixed_mask=first, moving_mask=second, settings=settings.align)
-
-
->>>>>>> wtS
 def _midspace(
     fixed: PlacedImage,
     moving: PlacedImage,
@@ -205,8 +190,8 @@ class _Optimised:
 
     u: Tensor
     records: tuple[LevelRecord, ...]
-    objective: tuple[Tensor, Tensor]
-    marks: tuple[Tensor, Tensor]
+    objective: tuple[Tensor, ...]
+    marks: tuple[Tensor, ...]
     seconds: float
 
 
@@ -221,12 +206,8 @@ def _optimise(
     began = perf_counter()
     if start is not None:
         start = _checked_start(start, problem)
-<<<<<<< HEAD
     elif settings.starts_discretely:
-=======
-    elif settings.start == "discrete":
         begin("searching")
->>>>>>> wtS
         start = discrete_start(
             problem.fixed, problem.moving, problem.grid, mask=problem.fixed_mask, settings=settings.discrete
         )
@@ -238,9 +219,9 @@ def _optimise(
         objective = forward_objective(problem, problem.grid, settings)
         zero = torch.zeros_like(u)
         u = best_map(objective, settings, u, zero if start is None else start, zero)
-        before, after = objective.similarity.on_common_voxels([zero, u])
+        values = objective.similarity.on_common_voxels([zero, u])
         marks = _marks(problem, settings, zero, u)
-    return _Optimised(u, records, (before, after), marks, perf_counter() - began)
+    return _Optimised(u, records, tuple(values), marks, perf_counter() - began)
 
 
 def _marks(problem: RegistrationProblem, settings: RegistrationSettings, *maps: Tensor) -> tuple[Tensor, ...]:

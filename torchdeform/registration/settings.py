@@ -8,7 +8,7 @@ from torchdeform.core.flow import OdeSolver
 from torchdeform.core.image import AUTO
 from torchdeform.errors import RANGES, InputError, require_choice, require_ranges
 from torchdeform.fem.solver import SolverSettings
-from torchdeform.metrics.similarity import AUTO, similarity_weights
+from torchdeform.metrics.similarity import similarity_weights
 from torchdeform.registration.affine.settings import AlignmentSettings
 
 STARTS = (AUTO, "identity", "discrete")
@@ -20,12 +20,12 @@ class SimilaritySettings:
     """What is compared, and how.
 
     Args:
-        measure: ``auto`` (``lncc`` for images of one contrast, ``mind`` for others; without `Image`s or a look at them
-            it is ``lncc``), ``lncc`` (squared local normalised cross-correlation, for images of one contrast with different
-            brightness), ``ncc`` (the correlation of whole images), ``ssd`` (mean squared difference, for images on the
-            same intensity scale); for images of different contrast ``mi`` and ``nmi`` (mutual information, normalised),
-            ``ngf`` (directions of the gradients), ``mind`` (self-similarity of patches). Or several of them with
-            positive weights, as ``{lncc: 1, mi: 0.5}``.
+        measure: ``auto`` looks at the images and takes ``lncc`` where they have one contrast and ``mind`` where they do
+            not (``lncc`` in layers). For images of one contrast: ``lncc`` (squared local normalised cross-correlation,
+            whatever the brightness), ``ncc`` (the correlation of whole images), ``ssd`` (mean squared difference, for
+            images on the same intensity scale). For images of different contrast: ``mind`` (self-similarity of
+            patches), ``mi`` and ``nmi`` (mutual information, normalised), ``ngf`` (directions of the gradients). Or
+            several of them with positive weights, as ``{lncc: 1, mi: 0.5}``.
         window: width of the LNCC window in voxels, odd.
 
     Raises:
