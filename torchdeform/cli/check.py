@@ -7,12 +7,12 @@ from typing import Annotated
 import typer
 
 from torchdeform.cli.options import FixedMask, Json, MovingMask, choice, print_json
-from torchdeform.core.image import Image
+from torchdeform.core.image import Image, is_oblique, orientation
 from torchdeform.errors import InputError, require_choice
 from torchdeform.io import read_image
 from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.io.images import read_optional
-from torchdeform.pipeline.preflight import ERROR, Finding, is_oblique, orientation, preflight
+from torchdeform.pipeline.preflight import ERROR, Finding, preflight
 from torchdeform.registration.affine.settings import ALIGNMENTS
 from torchdeform.report.figures import write_overlay
 
@@ -85,8 +85,8 @@ def _properties(image: Image) -> dict[str, str]:
     return {
         "file": image.name,
         "size": " × ".join(map(str, image.grid.shape[::-1])),
-        "spacing (mm)": " × ".join(f"{h:.4g}" for h in image.grid.spacing[::-1]),
-        "origin (mm)": ", ".join(f"{x:.5g}" for x in image.origin),
+        "spacing": " × ".join(f"{image.in_unit(h):.4g}" for h in image.grid.spacing[::-1]) + f" {image.unit}",
+        "origin": ", ".join(f"{image.in_unit(x):.5g}" for x in image.origin) + f" {image.unit}",
         "orientation": orientation(image) + (" (oblique)" if is_oblique(image) else ""),
         "intensities": f"{low:.5g} to {high:.5g}, {image.pixel_type}",
         "channels": str(image.data.shape[1]),

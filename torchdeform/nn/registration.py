@@ -8,9 +8,10 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from torchdeform.core.grid import Grid
+from torchdeform.core.image import AUTO
 from torchdeform.core.warp import warp
 from torchdeform.errors import require_choice, require_ranges
-from torchdeform.metrics.similarity import AUTO, INTENSITIES, MEASURES
+from torchdeform.metrics.similarity import INTENSITIES, MEASURES
 from torchdeform.nn.precision import full_precision
 from torchdeform.registration.optimise import Level, Objective, optimise_level
 from torchdeform.registration.settings import RegistrationSettings

@@ -12,6 +12,7 @@ from torchdeform.core.grid import Grid, limit_threads
 from torchdeform.core.image import Image, resample, same_place
 from torchdeform.core.intensities import require_finite
 from torchdeform.core.resampling import MIN_NODES, prolong
+from torchdeform.core.stages import begin
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import invert, warp
 from torchdeform.errors import ComputationError, InputError
@@ -78,9 +79,10 @@ def register(
         One step: force = N ∂S/∂warped ∇warped; K v = M force + load of a divergence where the map is nearly folded, K
         being the div-curl least squares with w_d, w_c and w_0 = w_d / length²; φ ← φ ∘ flow(v), the longest move being
         ``step_length`` voxels, less where a one-sided determinant would fall below ``min_determinant``. A level keeps
-        its most similar map. Items of a batch do not influence each other. Liu, Liao & Xue 2007, section 2, with the
-        controls driven by the images. The result is never less similar than its start, over the same voxels. Landmarks add the force of their squared distance at the points. With
-        ``symmetric`` two maps from a space between move against each other, and φ = φ_m ∘ φ_f⁻¹.
+        its most similar map, and the result is never less similar than its start, over the same voxels. Items of a
+        batch do not influence each other. Liu, Liao & Xue 2007, section 2, with the controls driven by the images.
+        Landmarks add the force of their squared distance at the points. With ``symmetric`` two maps from a space
+        between move against each other, and φ = φ_m ∘ φ_f⁻¹.
     """
     settings, annotations = config or RegistrationSettings(), annotations or Annotations()
     if isinstance(fixed, Image) and isinstance(moving, Image):
@@ -166,7 +168,7 @@ def _register_images(
     space = _midspace(*both, problem, affine, settings) if settings.symmetric else None
     found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
     del problem, space
-    warped = _warped(fixed, moving, affine, found.u)
+    warped = _warped(fixed, moving, affine, found.u, settings)
     alignment, result = placed.alignment, _result(found, fixed.grid, warped, settings)
     result = replace(
         result,
@@ -199,10 +201,10 @@ def _midspace(
     return replace(space, problem=space.problem.scaled(settings))
 
 
-def _warped(fixed: Image, moving: Image, affine: Affine | None, u: Tensor) -> Tensor:
+def _warped(fixed: Image, moving: Image, affine: Affine | None, u: Tensor, settings: RegistrationSettings) -> Tensor:
     """Return the moving image on the fixed grid, sampled once."""
     seen = moving if affine is None else moved(moving, affine.inverse())
-    return resample(seen, fixed, u).to(moving.data.dtype)
+    return resample(seen, fixed, u, outside=settings.outside).to(moving.data.dtype)
 
 
 @dataclass(frozen=True)
@@ -211,8 +213,8 @@ class _Optimised:
 
     u: Tensor
     records: tuple[LevelRecord, ...]
-    objective: tuple[Tensor, Tensor]
-    marks: tuple[Tensor, Tensor]
+    objective: tuple[Tensor, ...]
+    marks: tuple[Tensor, ...]
     seconds: float
 
 
@@ -228,6 +230,7 @@ def _optimise(
     if start is not None:
         start = _checked_start(start, problem)
     elif settings.starts_discretely:
+        begin("searching")
         start = discrete_start(
             problem.fixed, problem.moving, problem.grid, mask=problem.fixed_mask, settings=settings.discrete
         )
@@ -239,9 +242,9 @@ def _optimise(
         objective = forward_objective(problem, problem.grid, settings)
         zero = torch.zeros_like(u)
         u = best_map(objective, settings, u, zero if start is None else start, zero)
-        before, after = objective.similarity.on_common_voxels([zero, u])
+        values = objective.similarity.on_common_voxels([zero, u])
         marks = _marks(problem, settings, zero, u)
-    return _Optimised(u, records, (before, after), marks, perf_counter() - began)
+    return _Optimised(u, records, tuple(values), marks, perf_counter() - began)
 
 
 def _marks(problem: RegistrationProblem, settings: RegistrationSettings, *maps: Tensor) -> tuple[Tensor, ...]:
@@ -264,6 +267,7 @@ def _checked_start(start: Tensor, problem: RegistrationProblem) -> Tensor:
 
 def _result(found: _Optimised, grid: Grid, warped: Tensor, settings: RegistrationSettings) -> RegistrationResult:
     """Invert the map and measure it."""
+    begin("inverting")
     with limit_threads(len(found.u), grid):
         start = perf_counter()
         inverse = invert(found.u, grid)
@@ -319,7 +323,7 @@ def resample_result(
         displacement=u,
         inverse=inverse,
         grid=grid,
-        warped=_warped(fixed, moving, result.affine, u),
+        warped=_warped(fixed, moving, result.affine, u, result.settings),
         diagnosis=diagnose(u, grid),
         inverse_error_mean=mean,
         inverse_error_max=largest,

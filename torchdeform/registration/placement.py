@@ -7,11 +7,12 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image, overlap
+from torchdeform.core.image import AUTO, Image, overlap
 from torchdeform.core.resampling import box_sum, with_spacing
+from torchdeform.core.stages import begin
 from torchdeform.core.transform import Affine
 from torchdeform.metrics.correlation import LNCC_FLOOR, contrast, local_contrast
-from torchdeform.metrics.similarity import AUTO, mark
+from torchdeform.metrics.similarity import mark
 from torchdeform.registration.affine.align import Alignment, align
 from torchdeform.registration.problem import Annotations, PlacedImage, RegistrationProblem, placed_images, resample_pair
 from torchdeform.registration.settings import RegistrationSettings
@@ -74,16 +75,16 @@ def place(
     settings, choice = choose(problem, settings)
     if alignment is None:
         return Placement(settings, affine, choice=choice)
-    plain = problem_at(*both, None) if overlap(fixed, moving) > 0 else None
-    unaligned = None if plain is None else _marked(plain, settings)
-    if unaligned is not None and not bool(_marked(problem, settings)[1] > unaligned[1] + _GAIN):
+    unaligned, merit = _marked(problem_at(*both, None), settings) if overlap(fixed, moving) > 0 else (None, None)
+    if merit is not None and not bool(_marked(problem, settings)[1] > merit + _GAIN):
         kept = replace(alignment, affine=Affine.identity(fixed.grid.dim), start="geometry")
         alignment = replace(kept, similarity_after=alignment.similarity_before)
-    return Placement(settings, alignment.affine, alignment, unaligned and unaligned[0], choice)
+    return Placement(settings, alignment.affine, alignment, unaligned, choice)
 
 
 def _align(fixed: Image, moving: Image, settings: RegistrationSettings, annotations: Annotations) -> Alignment:
     """Align as the settings say, with masks."""
+    begin("aligning")
     masks = (annotations.fixed_mask, annotations.moving_mask)
     first, second = (mask if isinstance(mask, Image) else None for mask in masks)
     return align(fixed, moving, fixed_mask=first, moving_mask=second, settings=settings.align)
@@ -94,11 +95,11 @@ def problem_at(fixed: PlacedImage, moving: PlacedImage, affine: Affine | None) -
     return resample_pair(fixed, moving if affine is None else moving.moved(affine.inverse()), fixed.image)
 
 
-def _marked(problem: RegistrationProblem, settings: RegistrationSettings) -> tuple[Tensor, Tensor] | None:
-    """Return mark and merit of two images, each ``(B,)``; None where they have no voxel in common."""
+def _marked(problem: RegistrationProblem, settings: RegistrationSettings) -> tuple[Tensor, Tensor]:
+    """Return mark and merit of two images, each ``(B,)``, 0 where they have no voxel in common."""
     mask = problem.mask
     if mask is not None and not bool((mask > 0).flatten(1).any(1).all()):
-        return None
+        return (nothing := problem.fixed.new_zeros(len(problem.fixed))), nothing
     scaled, chosen = problem.scaled(settings), settings.similarity
     found = mark(chosen.measure, scaled.fixed, scaled.moving, mask=mask, window=chosen.window, grid=problem.grid)
     contrast = local_contrast(scaled.fixed, chosen.window)

@@ -1,12 +1,14 @@
 """Settings of a registration, nested by subject: typed, frozen, checked when made."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from torchdeform.core.flow import OdeSolver
+from torchdeform.core.image import AUTO
 from torchdeform.errors import RANGES, InputError, require_choice, require_ranges
 from torchdeform.fem.solver import SolverSettings
-from torchdeform.metrics.similarity import AUTO, similarity_weights
+from torchdeform.metrics.similarity import similarity_weights
 from torchdeform.registration.affine.settings import AlignmentSettings
 
 STARTS = (AUTO, "identity", "discrete")
@@ -18,12 +20,12 @@ class SimilaritySettings:
     """What is compared, and how.
 
     Args:
-        measure: ``auto`` (``lncc`` for images of one contrast, ``mind`` for others; without `Image`s or a look at them
-            it is ``lncc``), ``lncc`` (squared local normalised cross-correlation, for images of one contrast with different
-            brightness), ``ncc`` (the correlation of whole images), ``ssd`` (mean squared difference, for images on the
-            same intensity scale); for images of different contrast ``mi`` and ``nmi`` (mutual information, normalised),
-            ``ngf`` (directions of the gradients), ``mind`` (self-similarity of patches). Or several of them with
-            positive weights, as ``{lncc: 1, mi: 0.5}``.
+        measure: ``auto`` looks at the images and takes ``lncc`` where they have one contrast and ``mind`` where they do
+            not (``lncc`` in layers). For images of one contrast: ``lncc`` (squared local normalised cross-correlation,
+            whatever the brightness), ``ncc`` (the correlation of whole images), ``ssd`` (mean squared difference, for
+            images on the same intensity scale). For images of different contrast: ``mind`` (self-similarity of
+            patches), ``mi`` and ``nmi`` (mutual information, normalised), ``ngf`` (directions of the gradients). Or
+            several of them with positive weights, as ``{lncc: 1, mi: 0.5}``.
         window: width of the LNCC window in voxels, odd.
 
     Raises:
@@ -211,6 +213,8 @@ class RegistrationSettings:
         points_weight: what landmarks weigh against the similarity: the mean of |φ(p) − q|² over the pairs, in squared
             units of spacing (mm² for images), is multiplied by this and taken off; 0 only measures them.
         symmetric: prefer neither image: both are warped into a space between, so that swapping them inverts the map.
+        outside: value of ``warped`` where an image (not a tensor) does not reach: a number, or ``auto`` for what
+            surrounds it, the grey value of its border if that is nearly constant, else its minimum.
 
     Raises:
         InputError: a value out of range, named.
@@ -228,6 +232,7 @@ class RegistrationSettings:
     stencil: str = "auto"
     points_weight: float = 0.0
     symmetric: bool = False
+    outside: float | str = AUTO
 
     def __post_init__(self) -> None:
         for name, key in SHORT_FORMS.items():
@@ -236,6 +241,10 @@ class RegistrationSettings:
                 object.__setattr__(self, name, replace(_SHORT_DEFAULTS[name], **{key: value}))
         require_choice(self.start, STARTS, "start")
         require_choice(self.stencil, STENCILS, "stencil")
+        if isinstance(self.outside, str):
+            require_choice(self.outside, (AUTO,), "outside, if it is no number,")
+        else:
+            require_ranges(self, "", outside=(math.isfinite, "be finite"))
         require_ranges(self, "", points_weight="finite, not negative")
 
     @property
