@@ -45,7 +45,9 @@ def misses(rows: Iterable[tuple[Case, td.Verdict]]) -> list[str]:
     for case, verdict in rows:
         must = case.kind in MUST_BE_BAD
         allowed = {GOOD} if case.kind == GOOD_PAIR else {BAD} if must else {LOOK, BAD}
-        found += [f"{case.kind} | {case.name}: {verdict.kind}. {verdict.headline}"] if verdict.kind not in allowed else []
+        found += (
+            [f"{case.kind} | {case.name}: {verdict.kind}. {verdict.headline}"] if verdict.kind not in allowed else []
+        )
     return found
 
 

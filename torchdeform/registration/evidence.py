@@ -244,7 +244,7 @@ class Views:
     def structure(self) -> float:
         """Return 1 - D / (D of images pushed apart), D being the squared difference of their MIND features."""
         views = replace(self, fixed=mind_ssc(self.fixed), moving=mind_ssc(self.moving))
-        away = [view._difference() for view in views._pushed()]
+        away = [view._difference() for view in views.pushed()]
         return 1 - views._difference() / max(sum(away) / len(away), _TINY)
 
     def _difference(self) -> float:
@@ -261,11 +261,11 @@ class Views:
         return tuple(names[axis] for axis in ways[best]) if values[best] > values[0] + _BETTER else ()
 
     def _informations(self, views: Sequence["Views"]) -> list[float]:
-        away = [view._mutual() for view in self._pushed()]
+        away = [view._mutual() for view in self.pushed()]
         least, most = sum(away) / len(away), replace(self, moving=self.fixed)._mutual()
         return [(view._mutual() - least) / max(most - least, _LEAST) for view in views]
 
-    def _pushed(self) -> Iterator["Views"]:
+    def pushed(self) -> Iterator["Views"]:
         for axis, share in product(self.grid.axes, _AWAY):
             yield self._moved(partial(_rolled, axis=axis, share=share))
 
