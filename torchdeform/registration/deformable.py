@@ -175,7 +175,7 @@ def _register_images(
         affine=affine,
         alignment=alignment,
         warnings=alignment.warnings if alignment else (),
-        unit="mm",
+        unit=fixed.unit,
         choice=placed.choice,
         similarity_before=result.similarity_before if placed.unaligned is None else placed.unaligned,
         similarity_aligned=result.similarity_before if alignment else None,
