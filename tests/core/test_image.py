@@ -8,7 +8,16 @@ import pytest
 import torch
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image, luminance, overlap, require_registrable, resample, surroundings
+from torchdeform.core.image import (
+    Image,
+    is_oblique,
+    luminance,
+    orientation,
+    overlap,
+    require_registrable,
+    resample,
+    surroundings,
+)
 from torchdeform.errors import InputError
 
 
@@ -175,3 +184,22 @@ def test_outside_of_colours_is_their_surroundings():
     assert found[0, :, :, 25:].flatten(1).unique(dim=1).T.tolist() == [[240.0, 235.0, 230.0]]
     with pytest.raises(InputError, match="outside, if it is no number, must be one of auto, got 'white'"):
         resample(image, far, outside="white")
+
+
+@pytest.mark.parametrize(
+    ("direction", "letters", "oblique"),
+    [
+        (((1, 0, 0), (0, 1, 0), (0, 0, 1)), "LPS", False),
+        (((-1, 0, 0), (0, -1, 0), (0, 0, 1)), "RAS", False),
+        (((-1, 0, 0), (0, -1, 0), (0, 0, -1)), "RAI", False),
+        (((0, 0, -1), (1, 0, 0), (0, 1, 0)), "PSR", False),
+        (((0, 0, 1), (-1, 0, 0), (0, -1, 0)), "AIL", False),
+        (((0.936, -0.275, 0.218), (0.29, 0.956, -0.037), (-0.199, 0.098, 0.975)), "LPS", True),
+        (((0, 1), (-1, 0)), "AL", False),
+        (((0.8, -0.6), (0.6, 0.8)), "LP", True),
+    ],
+)
+def test_orientation_codes(direction, letters, oblique):
+    dim = len(direction)
+    image = Image(torch.rand(1, 1, *[3] * dim), Grid((3,) * dim), direction=direction)
+    assert (orientation(image), is_oblique(image)) == (letters, oblique)

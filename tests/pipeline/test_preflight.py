@@ -18,9 +18,7 @@ from torchdeform.pipeline.preflight import (
     WARNING,
     Report,
     flip_correlations,
-    is_oblique,
     looks_like_labels,
-    orientation,
     preflight,
 )
 from torchdeform.registration.settings import RegistrationSettings
@@ -206,25 +204,6 @@ def test_errors_come_first():
     severities = [finding.severity for finding in preflight(fixed, moving).findings]
     assert severities == sorted(severities, key=[ERROR, WARNING, NOTE].index)
     assert severities[0] == ERROR
-
-
-@pytest.mark.parametrize(
-    ("direction", "letters", "oblique"),
-    [
-        (((1, 0, 0), (0, 1, 0), (0, 0, 1)), "LPS", False),
-        (((-1, 0, 0), (0, -1, 0), (0, 0, 1)), "RAS", False),
-        (((-1, 0, 0), (0, -1, 0), (0, 0, -1)), "RAI", False),
-        (((0, 0, -1), (1, 0, 0), (0, 1, 0)), "PSR", False),
-        (((0, 0, 1), (-1, 0, 0), (0, -1, 0)), "AIL", False),
-        (((0.936, -0.275, 0.218), (0.29, 0.956, -0.037), (-0.199, 0.098, 0.975)), "LPS", True),
-        (((0, 1), (-1, 0)), "AL", False),
-        (((0.8, -0.6), (0.6, 0.8)), "LP", True),
-    ],
-)
-def test_orientation_codes(direction, letters, oblique):
-    dim = len(direction)
-    image = Image(torch.rand(1, 1, *[3] * dim), Grid((3,) * dim), direction=direction)
-    assert (orientation(image), is_oblique(image)) == (letters, oblique)
 
 
 @pytest.mark.data

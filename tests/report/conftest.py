@@ -8,9 +8,11 @@ import pytest
 import torch
 from nested_settings import settings_of
 
+from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine
 from torchdeform.metrics.evaluation import Evaluation, Measures
 from torchdeform.registration.affine.align import Alignment
+from torchdeform.registration.problem import Annotations
 from torchdeform.report.record import describe, repeat_command
 from torchdeform.report.report_data import ReportData, make_report_data
 
@@ -43,20 +45,42 @@ def make_full(make_image, make_result) -> Callable[..., tuple[ReportData, dict[s
             affine=shift,
             alignment=Alignment(shift, 0.1, 0.2, "centres", 0.5, ()),
             evaluation=_evaluation(labels, landmarks),
+            warnings=(f"this is odd: {NASTY}",),
         )
+        object.__setattr__(result, "absent", _corner(fixed).data)
         record = describe(result, fixed, moving)
         inputs = {"fixed": fixed.name, "moving": moving.name, "out": "my results"}
         record |= {
             "inputs": inputs,
-            "warnings": (f"this is odd: {NASTY}",),
             "seconds": {"read": 0.1, **result.seconds},
             "memory": {"read": 10**8, "optimise": 2 * 10**9},
             "command": repeat_command(inputs, settings, "cpu", 10**9),
             "folder": "/home/somebody",
         }
-        return make_report_data(fixed, moving, result, slices=7), record
+        return make_report_data(fixed, moving, result, annotations=_annotations(fixed, moving), slices=7), record
 
     return make
+
+
+def _corner(image: Image) -> Image:
+    """1 in a box around the middle of an image, else 0."""
+    data = torch.zeros_like(image.data[:, :1])
+    data[(..., *(slice(n // 3, n // 2) for n in image.grid.shape))] = 1.0
+    return replace(image, data=data)
+
+
+def _annotations(fixed: Image, moving: Image) -> Annotations:
+    """Labels, masks and landmarks in the middle of both images."""
+    middle = fixed.to_world(torch.tensor(fixed.grid.extent, dtype=torch.float64).view(1, -1, 1) / 2)
+    steps = torch.linspace(-4, 4, 4, dtype=torch.float64).view(1, 1, -1)
+    return Annotations(
+        fixed_mask=_corner(fixed),
+        moving_mask=_corner(moving),
+        fixed_labels=_corner(fixed),
+        moving_labels=_corner(moving),
+        fixed_points=middle + steps,
+        moving_points=middle + 1.5 * steps,
+    )
 
 
 def _evaluation(labels: int, landmarks: int) -> Evaluation:

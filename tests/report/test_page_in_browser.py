@@ -68,15 +68,57 @@ def test_slices_move_with_the_arrow_keys(browser, page):
         return
     at = "[...document.querySelectorAll('img.slice')].map(i => [i.dataset.plane, getComputedStyle(i).objectPosition])"
     before = browser.run(at)
-    shown = "[...document.querySelectorAll('path[data-plane]')].findIndex(p => getComputedStyle(p).display != 'none')"
-    path = browser.run(shown)
+    grid = "document.querySelector(document.querySelector('.grid use').getAttribute('href')).getAttribute('d')"
+    path = browser.run(grid)
     _focus(browser, "input[data-plane=axial]")
     browser.press("ArrowRight")
     moved = browser.run(at)
     assert {plane for (plane, a), (_, b) in zip(before, moved, strict=True) if a != b} == {"axial"}
     assert all((a != b) == (plane == "axial") for (plane, a), (_, b) in zip(before, moved, strict=True))
-    assert browser.run(shown) == path + 1
+    assert browser.run(grid) != path
+    browser.press("ArrowLeft")
+    assert browser.run(grid) == path
     assert "of 20" in browser.run("document.querySelector('output[data-plane=axial]').textContent")
+
+
+def test_it_opens_at_the_worst_place(browser, page):
+    """The sliders start there, and a button takes them back; the place has a ring."""
+    rings = browser.run("[...document.querySelectorAll('.stage use.worst')].map(u => u.getBoundingClientRect().width)")
+    assert len(rings) == page
+    assert min(rings) > 5
+    if page == 3:
+        values = "[...document.querySelectorAll('.slice-number')].map(input => input.value)"
+        start = browser.run(values)
+        _focus(browser, "input[data-plane=coronal]")
+        browser.press("Home" if int(start[1]) else "End")
+        assert browser.run(values) != start
+        _focus(browser, "#worst")
+        browser.press("Enter")
+        assert browser.run(values) == start
+
+
+def test_what_is_drawn_is_shown_and_hidden(browser, page):
+    """Every kind of mark has its box in the legend and is visible until it is cleared."""
+    kinds = browser.run("[...document.querySelectorAll('input[name=shown]')].map(input => input.value)")
+    assert set(kinds) - {"no-data"} == {"outlines", "landmarks", "masks", "absent", "worst"}
+    for kind in kinds if page == 3 else set(kinds) - {"no-data"}:  # in 2D the map stays inside the moving image
+        drawn = f"[...document.querySelectorAll('.stage use.{kind}:not([hidden])')]"
+        seen = f"{drawn}.filter(u => getComputedStyle(u).visibility == 'visible' && u.getBBox().width > 0).length"
+        assert browser.run(seen) > 0, kind
+        _focus(browser, f"input[value={kind}]")
+        browser.press("Space")
+        assert browser.run(seen) == 0, kind
+        browser.press("Space")
+        assert browser.run(seen) > 0, kind
+
+
+def test_marks_follow_the_image_that_is_compared(browser, page):
+    """Outlines and arrows are those of the image that is chosen, besides those of the fixed one."""
+    images = "[...new Set([...document.querySelectorAll('.stage use:not([hidden])')].map(u => u.dataset.image))].sort()"
+    assert browser.run(images) == ["fixed", "warped"]
+    _focus(browser, "input[value=warped]")
+    browser.press("ArrowRight")
+    assert browser.run(images) == ["fixed", "moving"]
 
 
 def test_the_line_moves_by_key_and_by_mouse(browser, page):

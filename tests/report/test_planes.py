@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.report.planes import PLANES, chosen_plane, planes_of
-from torchdeform.report.report_data import evenly_spaced
 
 
 def test_planes_show_the_patient_upright(make_image):
@@ -21,13 +21,32 @@ def test_planes_show_the_patient_upright(make_image):
         assert [(plane.axes[0], plane.flipped[0]) for plane in planes_of(image)] == vertical
 
 
+@pytest.mark.parametrize("direction", [((1, 0, 0), (0, 1, 0), (0, 0, 1)), ((0, 0, -1), (1, 0, 0), (0, 1, 0))])
+def test_letters_say_where_the_patient_is(make_image, direction):
+    """A step to the right of the picture goes to the side of the body that its letter names, and so downwards."""
+    image = Image(make_image((5, 6, 7)).data, Grid((5, 6, 7)), direction=direction)
+    ways = {"L": (1, 0, 0), "R": (-1, 0, 0), "P": (0, 1, 0), "A": (0, -1, 0), "S": (0, 0, 1), "I": (0, 0, -1)}
+    for plane in planes_of(image):
+        left, right, top, bottom = plane.letters
+        for axis, turned, letter, other in (
+            (plane.axes[1], plane.flipped[1], right, left),
+            (plane.axes[0], plane.flipped[0], bottom, top),
+        ):
+            step = torch.zeros(1, 3, 1, dtype=torch.float64)
+            step[0, axis] = -1.0 if turned else 1.0
+            way = (image.to_world(step) - image.to_world(torch.zeros_like(step))).flatten().tolist()
+            assert way == list(ways[letter]) == [-w for w in ways[other]]
+    assert [plane.letters for plane in planes_of(make_image((5, 6, 7)))] == ["RLAP", "RLSI", "APSI"]
+    assert planes_of(make_image((5, 6)))[0].letters == ""
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_points_of_slices_are_where_the_slices_are(make_image, dim):
     """Cutting the coordinates of all nodes gives the coordinates of the slices' nodes."""
     image = make_image((6, 7, 9)[-dim:], (2.0, 1.0, 0.5)[-dim:], tilted=True)
     every = image.grid.points(dtype=torch.float64)
     for plane in planes_of(image):
-        numbers = evenly_spaced(plane, 3)
+        numbers = (0,) if plane.depth == 1 else (1, plane.middle, plane.depth - 1)
         assert torch.equal(plane.arrange(plane.points(numbers)), plane.cut(every, numbers))
         assert plane.cut(every, numbers).shape == (len(numbers), dim, *plane.shape)
         assert torch.equal(plane.arrange(plane.chosen(every, numbers)), plane.cut(every, numbers))

@@ -7,12 +7,12 @@ from typing import Annotated
 import typer
 
 from torchdeform.cli.options import FixedMask, Json, MovingMask, choice, print_json
-from torchdeform.core.image import Image
+from torchdeform.core.image import Image, is_oblique, orientation
 from torchdeform.errors import InputError, require_choice
 from torchdeform.io import read_image
 from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.io.images import read_optional
-from torchdeform.pipeline.preflight import ERROR, Finding, is_oblique, orientation, preflight
+from torchdeform.pipeline.preflight import ERROR, Finding, preflight
 from torchdeform.registration.affine.settings import ALIGNMENTS
 from torchdeform.report.figures import write_overlay
 

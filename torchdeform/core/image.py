@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from itertools import permutations
 from typing import TypeVar
 
 import torch
@@ -14,6 +15,8 @@ from torchdeform.errors import InputError, require_choice
 # Alpha that means opaque, by pixel type; floating types count from 0 to 1.
 _OPAQUE = {"uint8": 255.0, "uint16": 65535.0}
 _RGBA = 4
+# Letters of the world axes x, y, z: what their positive and negative directions point to.
+_LETTERS = ("LR", "PA", "SI")
 
 # Units that lengths are shown in, and how long 1 of the world's coordinates is in them.
 UNITS = {"px": 1.0, "mm": 1.0, "µm": 1000.0}
@@ -267,3 +270,22 @@ def overlap(fixed: Image, moving: Image, *, samples: int = 32) -> float:
     sides = [torch.linspace(0, side, samples, dtype=torch.float64) for side in fixed.grid.extent]
     points = torch.stack(torch.meshgrid(*sides, indexing="ij")).unsqueeze(0)
     return float(inside_box(moving.to_grid(fixed.to_world(points)), moving.grid).double().mean())
+
+
+def orientation(image: Image) -> str:
+    """Return what the x, y and z index axes point to, as ``LPS`` (left, posterior, superior) or ``RAI``.
+
+    Args:
+        image: 2D or 3D.
+
+    Notes:
+        An oblique axis gets the nearest direction. No two axes get the same pair of letters.
+    """
+    along = permutations(range(image.grid.dim))
+    best = max(along, key=lambda axes: sum(abs(image.direction[world][k]) for k, world in enumerate(axes)))
+    return "".join(_LETTERS[world][int(image.direction[world][k] < 0)] for k, world in enumerate(best))
+
+
+def is_oblique(image: Image) -> bool:
+    """Return whether an axis deviates from the world axes by more than about one degree."""
+    return any(max(abs(row[k]) for row in image.direction) < math.cos(0.02) for k in range(image.grid.dim))

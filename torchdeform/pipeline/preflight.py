@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import permutations, product
+from itertools import product
 from pathlib import Path
 
 import torch
@@ -37,9 +37,6 @@ _BLOCKS = {2: 48, 3: 24}  # blocks along an axis of the images that are flipped
 # What is taken for labels: by the name of the file, by the number of values, by the share of equal neighbours.
 _LABEL_NAME = re.compile(r"(?<![a-z])(a?seg|segmentation|labels?|masks?|parcellation)(?![a-z])")
 _MOST_LABELS, _SAME = 1000, 0.5
-
-# Letters of the world axes x, y, z: what their positive and negative directions point to.
-_LETTERS = ("LR", "PA", "SI")
 
 
 @dataclass(frozen=True)
@@ -148,25 +145,6 @@ def looks_like_labels(image: Image) -> bool:
     inside = data != values[counts.argmax()]
     same = (data[..., 1:] == data[..., :-1])[inside[..., 1:]]
     return len(values) <= _MOST_LABELS and bool(same.float().mean() > _SAME)
-
-
-def orientation(image: Image) -> str:
-    """Return what the x, y and z index axes point to, as ``LPS`` (left, posterior, superior) or ``RAI``.
-
-    Args:
-        image: 2D or 3D.
-
-    Notes:
-        An oblique axis gets the nearest direction. No two axes get the same pair of letters.
-    """
-    along = permutations(range(image.grid.dim))
-    best = max(along, key=lambda axes: sum(abs(image.direction[world][k]) for k, world in enumerate(axes)))
-    return "".join(_LETTERS[world][int(image.direction[world][k] < 0)] for k, world in enumerate(best))
-
-
-def is_oblique(image: Image) -> bool:
-    """Return whether an axis deviates from the world axes by more than about one degree."""
-    return any(max(abs(row[k]) for row in image.direction) < math.cos(0.02) for k in range(image.grid.dim))
 
 
 def _check_values(image: Image) -> Iterator[Finding]:

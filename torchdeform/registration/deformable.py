@@ -17,9 +17,12 @@ from torchdeform.core.transform import Affine
 from torchdeform.core.warp import invert, warp
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.metrics.evaluation import evaluate_images, evaluate_tensors
-from torchdeform.registration.affine.align import Alignment, align
+from torchdeform.metrics.similarity import mark
+from torchdeform.registration.agreement import disagreement
 from torchdeform.registration.discrete import discrete_start
-from torchdeform.registration.optimise import forward_similarity, optimise_levels
+from torchdeform.registration.evidence import gather_evidence, to_compare, with_labels
+from torchdeform.registration.optimise import best_map, common_mask, forward_objective, optimise_levels
+from torchdeform.registration.placement import Placement, choose, place, problem_at
 from torchdeform.registration.problem import (
     Annotations,
     PlacedImage,
@@ -27,7 +30,6 @@ from torchdeform.registration.problem import (
     moved,
     placed_images,
     problem_of_tensors,
-    resample_pair,
 )
 from torchdeform.registration.result import Callback, LevelRecord, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
@@ -47,7 +49,7 @@ def register(
     config: RegistrationSettings | None = None,
     *,
     annotations: Annotations | None = None,
-    affine: Affine | None = None,
+    affine: Affine | Placement | None = None,
     start: Tensor | None = None,
     callback: Callback | None = None,
 ) -> RegistrationResult:
@@ -58,8 +60,8 @@ def register(
         moving: image that is warped; a tensor of the same shape, or an `Image` anywhere in the same world.
         config: settings; those of the preset ``default`` when None.
         annotations: masks, landmarks and labels.
-        affine: map A from the world of the fixed image to that of the moving one, for images; when None, that which
-            `align` finds as ``config.align`` says.
+        affine: map A from the world of the fixed image to that of the moving one, for images, or what `place` returned
+            for them; when None, that which `align` finds as ``config.align`` says.
         start: displacement ``(B, D, *S)`` in units of spacing to begin with, fold-free; what the coarsest level cannot
             hold of it is found again or lost. What ``config.start`` says when None.
         callback: is shown every step.
@@ -77,9 +79,10 @@ def register(
         One step: force = N ∂S/∂warped ∇warped; K v = M force + load of a divergence where the map is nearly folded, K
         being the div-curl least squares with w_d, w_c and w_0 = w_d / length²; φ ← φ ∘ flow(v), the longest move being
         ``step_length`` voxels, less where a one-sided determinant would fall below ``min_determinant``. A level keeps
-        its most similar map. Items of a batch do not influence each other. Liu, Liao & Xue 2007, section 2, with the
-        controls driven by the images. Landmarks add the force of their squared distance at the points. With
-        ``symmetric`` two maps from a space between move against each other, and φ = φ_m ∘ φ_f⁻¹.
+        its most similar map, and the result is never less similar than its start, over the same voxels. Items of a
+        batch do not influence each other. Liu, Liao & Xue 2007, section 2, with the controls driven by the images.
+        Landmarks add the force of their squared distance at the points. With ``symmetric`` two maps from a space
+        between move against each other, and φ = φ_m ∘ φ_f⁻¹.
     """
     settings, annotations = config or RegistrationSettings(), annotations or Annotations()
     if isinstance(fixed, Image) and isinstance(moving, Image):
@@ -102,14 +105,31 @@ def _register_tensors(
     grid = _checked_grid(fixed, moving, annotations)
     problem = problem_of_tensors(fixed, moving, grid, annotations)
     require_finite(problem.fixed, problem.moving, "register")
+    settings, choice = choose(problem, settings)
     problem = problem.scaled(settings)
     space = midspace_of_tensors(problem) if settings.symmetric else None
-    found = _optimise(problem, space, settings, start, callback)
+    found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
     del problem, space
     with limit_threads(len(found.u), grid):
         warped = warp(moving, found.u, grid)
         evaluation = evaluate_tensors(found.u, grid, labels=annotations.labels, points=annotations.points)
-    return replace(_result(found, grid, warped, settings), evaluation=evaluation)
+    result = replace(_result(found, grid, warped, settings), evaluation=evaluation, choice=choice)
+    return _examined(result, compared, (fixed, moving), annotations.labels)
+
+
+def _examined(
+    result: RegistrationResult,
+    compared: RegistrationProblem,
+    images: tuple[Tensor, Tensor],
+    labels: tuple[Tensor, Tensor] | None,
+) -> RegistrationResult:
+    """Return the result with its evidence, from images on a grid of few nodes, and labels on the images' own grids."""
+    began = perf_counter()
+    maps = (result.displacement, result.inverse, result.grid)
+    evidence = gather_evidence(compared, *maps, disagreement=disagreement(compared))
+    if labels is not None:
+        evidence = with_labels(evidence, images, labels)
+    return replace(result, evidence=evidence, seconds=result.seconds | {"judge": perf_counter() - began})
 
 
 def _checked_grid(fixed: Tensor, moving: Tensor, annotations: Annotations) -> Grid:
@@ -135,39 +155,36 @@ def _register_images(
     moving: Image,
     settings: RegistrationSettings,
     annotations: Annotations,
-    affine: Affine | None,
+    affine: Affine | Placement | None,
     start: Tensor | None,
     callback: Callback | None,
 ) -> RegistrationResult:
     """Take the moving image onto the fixed grid in its physical place, register, and sample the original once."""
     _require_size(fixed.grid)
     annotations.require_images(fixed.grid.dim)
-    both, alignment = placed_images(fixed, moving, annotations), None
-    if affine is None and settings.align.kind != "none":
-        alignment = _align(fixed, moving, settings, annotations)
-        affine = alignment.affine
-    aligned = both[1] if affine is None else both[1].moved(affine.inverse())
-    problem = resample_pair(both[0], aligned, fixed).scaled(settings)
+    placed = affine if isinstance(affine, Placement) else place(fixed, moving, settings, annotations, affine)
+    both, settings, affine = placed_images(fixed, moving, annotations), placed.settings, placed.affine
+    problem = problem_at(*both, affine).scaled(settings)
     space = _midspace(*both, problem, affine, settings) if settings.symmetric else None
-    found = _optimise(problem, space, settings, start, callback)
+    found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
     del problem, space
     warped = _warped(fixed, moving, affine, found.u, settings)
-    result = _result(found, fixed.grid, warped, settings)
-    return replace(
+    alignment, result = placed.alignment, _result(found, fixed.grid, warped, settings)
+    result = replace(
         result,
         affine=affine,
         alignment=alignment,
+        warnings=alignment.warnings if alignment else (),
+        unit="mm",
+        choice=placed.choice,
+        similarity_before=result.similarity_before if placed.unaligned is None else placed.unaligned,
+        similarity_aligned=result.similarity_before if alignment else None,
         evaluation=evaluate_images(fixed, affine, found.u, labels=annotations.labels, points=annotations.points),
         seconds=({"align": alignment.seconds} if alignment else {}) | result.seconds,
     )
-
-
-def _align(fixed: Image, moving: Image, settings: RegistrationSettings, annotations: Annotations) -> Alignment:
-    """Align as the settings say, with masks."""
-    begin("aligning")
-    masks = (annotations.fixed_mask, annotations.moving_mask)
-    first, second = (mask if isinstance(mask, Image) else None for mask in masks)
-    return align(fixed, moving, fixed_mask=first, moving_mask=second, settings=settings.align)
+    given = annotations.labels
+    labels = given and (resample(given[0], fixed, mode="nearest"), resample(given[1], moving, mode="nearest"))
+    return _examined(result, compared, (fixed.data, moving.data), labels)
 
 
 def _midspace(
@@ -192,12 +209,12 @@ def _warped(fixed: Image, moving: Image, affine: Affine | None, u: Tensor, setti
 
 @dataclass(frozen=True)
 class _Optimised:
-    """Where the loop ended: the displacement on the fixed grid, how each level went, similarities, seconds."""
+    """Where the loop ended: the displacement on the fixed grid, how each level went, S and its mark, seconds."""
 
     u: Tensor
     records: tuple[LevelRecord, ...]
-    before: Tensor
-    after: Tensor
+    objective: tuple[Tensor, ...]
+    marks: tuple[Tensor, ...]
     seconds: float
 
 
@@ -212,7 +229,7 @@ def _optimise(
     began = perf_counter()
     if start is not None:
         start = _checked_start(start, problem)
-    elif settings.start == "discrete":
+    elif settings.starts_discretely:
         begin("searching")
         start = discrete_start(
             problem.fixed, problem.moving, problem.grid, mask=problem.fixed_mask, settings=settings.discrete
@@ -222,9 +239,20 @@ def _optimise(
     else:
         u, records = optimise_levels(problem, settings, start, callback)
     with limit_threads(len(u), problem.grid):
-        similarity = forward_similarity(problem, settings)
-        before, after = similarity.evaluate()[1], similarity.evaluate(u)[1]
-    return _Optimised(u, records, before, after, perf_counter() - began)
+        objective = forward_objective(problem, problem.grid, settings)
+        zero = torch.zeros_like(u)
+        u = best_map(objective, settings, u, zero if start is None else start, zero)
+        values = objective.similarity.on_common_voxels([zero, u])
+        marks = _marks(problem, settings, zero, u)
+    return _Optimised(u, records, tuple(values), marks, perf_counter() - began)
+
+
+def _marks(problem: RegistrationProblem, settings: RegistrationSettings, *maps: Tensor) -> tuple[Tensor, ...]:
+    """Return the `mark` of the images warped by each of the maps, over the voxels that all of them see."""
+    grid, chosen = problem.grid, settings.similarity
+    mask = common_mask(problem.fixed_mask, problem.moving_mask, maps, grid)
+    found = (warp(problem.moving, u, grid) for u in maps)
+    return tuple(mark(chosen.measure, problem.fixed, w, mask=mask, window=chosen.window, grid=grid) for w in found)
 
 
 def _checked_start(start: Tensor, problem: RegistrationProblem) -> Tensor:
@@ -250,8 +278,10 @@ def _result(found: _Optimised, grid: Grid, warped: Tensor, settings: Registratio
             inverse=inverse,
             warped=warped,
             grid=grid,
-            similarity_before=found.before,
-            similarity_after=found.after,
+            similarity_before=found.marks[0],
+            similarity_after=found.marks[1],
+            objective_before=found.objective[0],
+            objective_after=found.objective[1],
             diagnosis=_require_sound(found.u, grid),
             inverse_error_mean=mean,
             inverse_error_max=largest,

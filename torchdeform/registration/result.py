@@ -8,9 +8,12 @@ from torch import Tensor
 from torchdeform.core.diagnostics import Diagnosis
 from torchdeform.core.grid import Grid
 from torchdeform.core.transform import Affine
+from torchdeform.errors import InputError
 from torchdeform.metrics.evaluation import Evaluation
 from torchdeform.registration.affine.align import Alignment
+from torchdeform.registration.evidence import Evidence
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.verdict import Verdict, judge
 
 
 @dataclass(frozen=True)
@@ -64,8 +67,11 @@ class RegistrationResult:
         inverse: displacement of φ⁻¹ on the same grid; takes points of the moving space to the fixed space.
         warped: moving image seen through φ ``(B, C, *S)``.
         grid: the fixed grid.
-        similarity_before: similarity of fixed and moving ``(B,)``, higher is better.
-        similarity_after: similarity of fixed and warped ``(B,)``.
+        similarity_before: `mark` of fixed and moving ``(B,)`` in their own place: 1 for equal images, about 0 for
+            unrelated ones.
+        similarity_after: that of fixed and warped ``(B,)``.
+        objective_before: what was maximised where the deformation began, ``(B,)``; higher is better.
+        objective_after: the same at the end, over the same voxels.
         diagnosis: determinants and folds of φ.
         inverse_error_mean: mean over x of |φ(φ⁻¹(x)) − x| in voxels ``(B,)``.
         inverse_error_max: its maximum ``(B,)``.
@@ -76,6 +82,12 @@ class RegistrationResult:
             moving(A(φ(x))); None for the identity. ``displacement``, ``inverse`` and ``diagnosis`` are of φ alone.
         alignment: how that map was found; None where it was given, or none was asked for.
         evaluation: what labels and landmarks say; None without them.
+        similarity_aligned: the mark after the alignment ``(B,)``, over the voxels of ``similarity_after``; None where
+            nothing was aligned.
+        choice: a sentence on the similarity that was chosen; None where it was given.
+        evidence: what the images and the map say, of each item.
+        warnings: sentences about what looks wrong with the images.
+        unit: what lengths are shown in.
     """
 
     displacement: Tensor
@@ -84,6 +96,8 @@ class RegistrationResult:
     grid: Grid
     similarity_before: Tensor
     similarity_after: Tensor
+    objective_before: Tensor
+    objective_after: Tensor
     diagnosis: Diagnosis
     inverse_error_mean: Tensor
     inverse_error_max: Tensor
@@ -93,3 +107,27 @@ class RegistrationResult:
     affine: Affine | None = None
     alignment: Alignment | None = None
     evaluation: Evaluation | None = None
+    similarity_aligned: Tensor | None = None
+    choice: str | None = None
+    evidence: tuple[Evidence, ...] = ()
+    warnings: tuple[str, ...] = ()
+    unit: str = "px"
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the registration of one pair went well.
+
+        Raises:
+            InputError: a batch of several pairs, whose `evidence` can be judged one by one.
+        """
+        if len(self.evidence) != 1:
+            raise InputError(f"verdict: there are {len(self.evidence)} pairs; register them one by one, or judge each")
+        return judge(
+            self.evidence[0],
+            self.grid,
+            folds=int(self.diagnosis.folds),
+            evaluation=self.evaluation,
+            mirror=self.alignment.mirror if self.alignment else 0.0,
+            warnings=self.warnings,
+            unit=self.unit,
+        )

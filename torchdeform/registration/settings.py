@@ -11,7 +11,7 @@ from torchdeform.fem.solver import SolverSettings
 from torchdeform.metrics.similarity import similarity_weights
 from torchdeform.registration.affine.settings import AlignmentSettings
 
-STARTS = ("identity", "discrete")
+STARTS = (AUTO, "identity", "discrete")
 STENCILS = ("auto", "convolution", "shifts")
 
 
@@ -20,18 +20,19 @@ class SimilaritySettings:
     """What is compared, and how.
 
     Args:
-        measure: ``lncc`` (squared local normalised cross-correlation, for images of one contrast with different
-            brightness), ``ncc`` (the correlation of whole images), ``ssd`` (mean squared difference, for images on the
-            same intensity scale); for images of different contrast ``mi`` and ``nmi`` (mutual information, normalised),
-            ``ngf`` (directions of the gradients), ``mind`` (self-similarity of patches). Or several of them with
-            positive weights, as ``{lncc: 1, mi: 0.5}``.
+        measure: ``auto`` looks at the images and takes ``lncc`` where they have one contrast and ``mind`` where they do
+            not (``lncc`` in layers). For images of one contrast: ``lncc`` (squared local normalised cross-correlation,
+            whatever the brightness), ``ncc`` (the correlation of whole images), ``ssd`` (mean squared difference, for
+            images on the same intensity scale). For images of different contrast: ``mind`` (self-similarity of
+            patches), ``mi`` and ``nmi`` (mutual information, normalised), ``ngf`` (directions of the gradients). Or
+            several of them with positive weights, as ``{lncc: 1, mi: 0.5}``.
         window: width of the LNCC window in voxels, odd.
 
     Raises:
         InputError: a value out of range, named.
     """
 
-    measure: str | Mapping[str, float] = "lncc"
+    measure: str | Mapping[str, float] = AUTO
     window: int = 9
 
     def __post_init__(self) -> None:
@@ -197,8 +198,8 @@ class RegistrationSettings:
     Args:
         align: how images (not tensors) are aligned first; as one value its ``kind``: ``none``, ``translation``,
             ``rigid``, ``similarity`` or ``affine``.
-        start: map to begin with: ``identity``, or ``discrete`` for one from a search over large displacements, see
-            `discrete_start`.
+        start: map to begin with: ``identity``, ``discrete`` for one from a search over large displacements, see
+            `discrete_start`, or ``auto``: discrete where ``mind`` is compared.
         discrete: settings of that search.
         similarity: what is compared; as one value its ``measure``.
         metric: what a velocity costs.
@@ -220,7 +221,7 @@ class RegistrationSettings:
     """
 
     align: AlignmentSettings = _ALIGN
-    start: str = "identity"
+    start: str = AUTO
     discrete: DiscreteSettings = _DISCRETE
     similarity: SimilaritySettings = _SIMILARITY
     metric: MetricSettings = _METRIC
@@ -245,3 +246,13 @@ class RegistrationSettings:
         else:
             require_ranges(self, "", outside=(math.isfinite, "be finite"))
         require_ranges(self, "", points_weight="finite, not negative")
+
+    @property
+    def starts_discretely(self) -> bool:
+        """Whether the map to begin with is searched for."""
+        return self.start == "discrete" or (self.start == AUTO and self.similarity.measure == "mind")
+
+    def with_similarity(self, measure: str | Mapping[str, float]) -> "RegistrationSettings":
+        """Return the same with this measure, and the start that goes with it in place of ``auto``."""
+        chosen = replace(self, similarity=replace(self.similarity, measure=measure))
+        return replace(chosen, start="discrete" if chosen.starts_discretely else "identity")

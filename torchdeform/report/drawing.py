@@ -1,6 +1,7 @@
 """Drawing on matplotlib axes: slices of images, maps with their scales, deformed grids, curves."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
@@ -29,18 +30,18 @@ _LARGEST = 1000  # pixels along a side that a panel can show
 Floats = NDArray[np.floating]
 
 
-def new_figure(width: float, height: float) -> "Figure":
-    """Return an empty figure of this size in inches."""
+def new_figure(width: float, height: float, *, constrained: bool = False) -> "Figure":
+    """Return an empty figure of this size in inches; matplotlib places the panels if it is ``constrained``."""
     from matplotlib.figure import Figure
 
-    return Figure((width, height), dpi=110, layout="constrained", facecolor=PAPER)
+    return Figure((width, height), dpi=110, layout="constrained" if constrained else None, facecolor=PAPER)
 
 
 def save_png(figure: "Figure", path: Path) -> None:
     """Write a figure as a PNG, without any window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    FigureCanvasAgg(figure).print_png(str(path))
+    FigureCanvasAgg(figure).print_png(str(path), pil_kwargs={"compress_level": 3})  # twice as fast as 6
 
 
 @dataclass(frozen=True)
@@ -107,21 +108,45 @@ def frame(axes: "Axes", plane: Plane) -> None:
         spine.set_color(FRAME)
 
 
-def draw_image(axes: "Axes", plane: Plane, pixels: Tensor) -> None:
+def draw_image(axes: "Axes", plane: Plane, pixels: Tensor) -> "AxesImage":
     """Show grey values or colours from 0 to 1."""
-    show(axes, plane, pixels, cmap="gray", vmin=0, vmax=1)
+    return show(axes, plane, pixels, cmap="gray", vmin=0, vmax=1)
 
 
-def draw_map(axes: "Axes", plane: Plane, values: Tensor, scale: Scale, *, bar: bool = True) -> None:
-    """Show values in the colours of their scale, with a colour bar below."""
-    shown = show(axes, plane, values, cmap=scale.colours, vmin=scale.low, vmax=scale.high)
-    if not bar:
-        return
-    place = axes.inset_axes((0.15, -0.08, 0.7, 0.035))
-    colours = axes.figure.colorbar(shown, cax=place, orientation="horizontal")
+def draw_map(axes: "Axes", plane: Plane, values: Tensor, scale: Scale) -> "AxesImage":
+    """Show values in the colours of their scale."""
+    return show(axes, plane, values, cmap=scale.colours, vmin=scale.low, vmax=scale.high)
+
+
+def draw_bar(place: "Axes", shown: "AxesImage", scale: Scale) -> None:
+    """Draw the colour bar of a map in axes of their own."""
+    colours = place.figure.colorbar(shown, cax=place, orientation="horizontal")
     colours.set_ticks([value for value, _ in scale.ticks], labels=[text for _, text in scale.ticks])
     colours.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
     place.tick_params(labelsize=8, colors=INK, length=2, pad=1)
+
+
+def draw_lines_over(axes: "Axes", lines: Sequence[Floats], colour: str, *, hatched: bool = False) -> None:
+    """Draw lines (across, down) in nodes over a slice, or hatch what is inside them."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
+
+    if not lines:
+        return
+    if hatched:
+        inside = Outline.make_compound_path(*(Outline(line, closed=True) for line in lines))
+        axes.add_patch(PathPatch(inside, facecolor="none", edgecolor=colour, linewidth=0.5, hatch="/////"))
+    else:
+        axes.add_collection(LineCollection(lines, colors=colour, linewidths=0.8), autolim=False)
+
+
+def draw_letters(axes: "Axes", plane: Plane) -> None:
+    """Write at the sides of a slice which sides of the body they are."""
+    places = ((0.02, 0.5, "left", "center"), (0.98, 0.5, "right", "center"), (0.5, 0.98, "center", "top"))
+    for letter, (x, y, ha, va) in zip(plane.letters, (*places, (0.5, 0.02, "center", "bottom")), strict=False):
+        text = axes.text(x, y, letter, transform=axes.transAxes, ha=ha, va=va, fontsize=8, color=PAPER, weight="bold")
+        text.set_bbox({"facecolor": INK, "alpha": 0.5, "pad": 1, "linewidth": 0})
 
 
 def moved_lines(plane: Plane, u: Tensor, count: int) -> list[Floats]:
@@ -157,9 +182,9 @@ def draw_lines(axes: "Axes", plane: Plane, u: Tensor, count: int) -> None:
     frame(axes, plane)
 
 
-def draw_faint(axes: "Axes", plane: Plane, pixels: Tensor) -> None:
+def draw_faint(axes: "Axes", plane: Plane, pixels: Tensor) -> "AxesImage":
     """Show an image as a pale background for lines."""
-    show(axes, plane, pixels.mean(0, keepdim=True), cmap="gray_r", vmin=0, vmax=3)
+    return show(axes, plane, pixels.mean(0, keepdim=True), cmap="gray_r", vmin=0, vmax=3)
 
 
 def draw_convergence(axes: "Axes", result: RegistrationResult, *, item: int = 0) -> None:

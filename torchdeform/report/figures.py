@@ -1,11 +1,11 @@
 """Pictures as files: the overview of a registration, images side by side, two images over each other."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,25 +17,29 @@ from torchdeform.core.image import Image, box_corners
 from torchdeform.core.warp import sample
 from torchdeform.metrics.similarity import measure_name
 from torchdeform.report.drawing import (
-    INK,
     difference_scale,
+    draw_bar,
     draw_convergence,
     draw_faint,
     draw_image,
+    draw_letters,
     draw_lines,
+    draw_lines_over,
     draw_map,
     frame,
-    new_figure,
     save_png,
     tinted,
     volume_scale,
 )
+from torchdeform.report.marks import ABSENT, LANDMARKS, NO_DATA, OUTLINES, REGIONS
 from torchdeform.report.planes import Plane, planes_of
-from torchdeform.report.report_data import ReportData, Slices, grey, to_unit
+from torchdeform.report.report_data import ReportData, Slices
+from torchdeform.report.sampling import FIXED, MOVING, WARPED, grey, to_unit
+from torchdeform.report.sheet import GAP, TITLE, Sheet, letters_in, shortened, title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
     from torchdeform.registration.result import RegistrationResult
 
@@ -44,11 +48,13 @@ _PANEL_INCHES = {2: 3.2, 3: 2.3}
 _GRID_LINES = {2: 36, 3: 24}
 _GALLERY_INCHES = {2: 3.2, 3: 2.2}
 _OUTLINES = ("#0b5fa5", "#b34700")
+_LEAST_CURVE = 1.0  # height of the convergence in inches
 _OVERLAY_INCHES = 3.0
+_OVERLAY = "fixed in blue, moving in orange, frames at their borders"
 _PIXELS = 400  # along the longer side of an overlay
 _FARTHEST = 3.0  # width of an overlay at most, in widths of the fixed image
 
-Draw = Callable[["Axes", ReportData, Slices], None]
+Draw = Callable[["Axes", ReportData, Slices], "AxesImage"]
 
 
 def write_overview(path: Path, data: ReportData) -> None:
@@ -58,65 +64,96 @@ def write_overview(path: Path, data: ReportData) -> None:
         path: the file to write.
         data: what `make_report_data` returns.
     """
-    result, dim = data.result, data.result.grid.dim
+    dim = data.result.grid.dim
     rows, columns = _SHEET[dim]
-    shapes = [cuts.plane.height_over_width for cuts in data.slices]
-    heights = [_PANEL_INCHES[dim] * min(2.0, max(0.4, shape)) for shape in shapes] * (rows // len(shapes))
-    figure, panels = _sheet(_PANEL_INCHES[dim], columns, heights, 0.3 * rows + 0.4)
-    cells = panels.flat
-    for cuts, (title, draw) in product(data.slices, _PANELS.items()):
+    width, shapes = _PANEL_INCHES[dim], [cuts.plane.height_over_width for cuts in data.slices]
+    heights = [width * min(2.0, shape) for shape in shapes] * (rows // len(shapes))
+    if dim == 2:
+        heights[-1] = max(heights[-1], _LEAST_CURVE)
+    room = [TITLE] * rows if dim == 2 else [TITLE, *[GAP] * (rows - 1)]
+    sheet = Sheet(width, columns, heights, room, headlines=_headlines(data, letters_in(width, columns)), bottom=0.5)
+    cells = chain(*sheet.panels)
+    scale = volume_scale(data.limits["log_det"])
+    for cuts, (name, draw) in product(data.slices, _PANELS.items()):
         axes = next(cells)
-        draw(axes, data, cuts)
-        axes.set_title(_title(title, result) if cuts is data.slices[0] else "", fontsize=10, color=INK)
+        shown = draw(axes, data, cuts)
+        axes.set_anchor("N")
+        if axes is sheet.panels[data.slices.index(cuts)][0]:
+            draw_letters(axes, cuts.plane)
+        if cuts is data.slices[0]:
+            title(axes, _title(name, data.result))
+        if name == _VOLUME and cuts is data.slices[-1]:
+            draw_bar(sheet.below(axes, 0.7 * width, 0.1, 0.12), shown, scale)
     for axes in cells:  # the last one, in 2D
-        draw_convergence(axes, result)
-        axes.set_title(f"{measure_name(result.settings.similarity.measure)} over the steps", fontsize=10, color=INK)
-        axes.set_ylabel("")
-        axes.set_box_aspect(shapes[0])
-    figure.suptitle(_headline(result), fontsize=11, color=INK)
-    save_png(figure, path)
+        _draw_convergence(axes, data.result, width, heights[-1])
+    save_png(sheet.figure, path)
 
 
-def _sheet(width: float, columns: int, heights: Sequence[float], room: float) -> "tuple[Figure, Any]":
-    """Return a figure and its axes by row and column: panels of these sizes in inches, and room for titles."""
-    figure = new_figure(columns * width, sum(heights) + room)
-    return figure, figure.subplots(len(heights), columns, squeeze=False, height_ratios=heights)
+def _draw_convergence(axes: "Axes", result: "RegistrationResult", width: float, height: float) -> None:
+    """Draw the similarity over the steps, with room for the numbers on the left within the panel."""
+    place = axes.get_position(original=True)
+    left = 0.45 / width * place.width
+    axes.set_position((place.x0 + left, place.y0, place.width - left, place.height))
+    axes.set_box_aspect(height / (width - 0.45))
+    draw_convergence(axes, result)
+    axes.set_ylabel("")
+    title(axes, f"{measure_name(result.settings.similarity.measure)} over the steps")
 
 
 def _title(panel: str, result: "RegistrationResult") -> str:
     """Return the title of a panel; the moving image is shown after the alignment."""
+    if panel == _VOLUME:
+        return f"{'area' if result.grid.dim == 2 else 'volume'}: moving / fixed"
     return f"{panel}, aligned" if panel == "moving" and result.affine is not None else panel
 
 
-def _headline(result: "RegistrationResult") -> str:
-    diagnosis = result.diagnosis
+def _headlines(data: ReportData, most: int) -> tuple[str, str]:
+    """Return the names of the files in so many letters, and the most important figures."""
+    result, diagnosis = data.result, data.result.diagnosis
     before, after = result.similarity_before.item(), result.similarity_after.item()
-    return (
-        f"{measure_name(result.settings.similarity.measure)} {before:.3g} → {after:.3g}     "
-        f"folds {int(diagnosis.folds.item())}     "
-        f"determinant {diagnosis.det_min.item():.2g} to {diagnosis.det_max.item():.2g}     "
-        f"inverse consistency {result.inverse_error_mean.item():.2g} voxel"
+    voxel = "pixel" if result.grid.dim == 2 else "voxel"
+    names = [shortened(Path(image.name).name, most // 2 - 3) for image in (data.moving, data.fixed)]
+    return " onto ".join(names), "     ".join(
+        (
+            f"{measure_name(result.settings.similarity.measure)} {before:.3g} → {after:.3g}",
+            f"folds {int(diagnosis.folds.item())}",
+            f"determinant {diagnosis.det_min.item():.2g} to {diagnosis.det_max.item():.2g}",
+            f"inverse consistency {result.inverse_error_mean.item():.2g} {voxel}",
+        )
     )
 
 
-def _draw_image(name: str, axes: "Axes", data: ReportData, cuts: Slices) -> None:
-    draw_image(axes, cuts.plane, cuts.fields[name][cuts.middle])
+def _draw_image(name: str, axes: "Axes", data: ReportData, cuts: Slices) -> "AxesImage":
+    shown = draw_image(axes, cuts.plane, cuts.fields[name][cuts.middle])
+    _draw_marks(axes, cuts, name, (OUTLINES, LANDMARKS, NO_DATA, ABSENT))
+    return shown
 
 
-def _draw_difference(name: str, axes: "Axes", data: ReportData, cuts: Slices) -> None:
-    draw_map(axes, cuts.plane, cuts.fields[name][cuts.middle], difference_scale(data.limits[name]), bar=False)
+def _draw_difference(name: str, axes: "Axes", data: ReportData, cuts: Slices) -> "AxesImage":
+    shown = draw_map(axes, cuts.plane, cuts.fields[name][cuts.middle], difference_scale(data.limits[name]))
+    _draw_marks(axes, cuts, {"before": MOVING, "after": WARPED}[name], REGIONS)
+    return shown
 
 
-def _draw_grid(axes: "Axes", data: ReportData, cuts: Slices) -> None:
+def _draw_marks(axes: "Axes", cuts: Slices, image: str, kinds: Collection[str]) -> None:
+    """Draw the marks of some kinds that belong over an image."""
+    for mark, lines in cuts.marks.items():
+        if mark.image in (FIXED, image) and mark.kind in kinds:
+            draw_lines_over(axes, lines[cuts.middle], mark.colour, hatched=mark.kind in REGIONS)
+
+
+def _draw_grid(axes: "Axes", data: ReportData, cuts: Slices) -> "AxesImage":
     """Draw where φ moves the lines of a regular grid, over the moving image."""
-    draw_faint(axes, cuts.plane, cuts.fields["moving"][cuts.middle])
+    shown = draw_faint(axes, cuts.plane, cuts.fields["moving"][cuts.middle])
     draw_lines(axes, cuts.plane, cuts.fields["u"][cuts.middle], _GRID_LINES[cuts.plane.grid.dim])
+    return shown
 
 
-def _draw_volume(axes: "Axes", data: ReportData, cuts: Slices) -> None:
-    draw_map(axes, cuts.plane, cuts.fields["log_det"][cuts.middle], volume_scale(data.limits["log_det"]))
+def _draw_volume(axes: "Axes", data: ReportData, cuts: Slices) -> "AxesImage":
+    return draw_map(axes, cuts.plane, cuts.fields["log_det"][cuts.middle], volume_scale(data.limits["log_det"]))
 
 
+_VOLUME = "volume"
 _PANELS: dict[str, Draw] = {
     "fixed": partial(_draw_image, "fixed"),
     "moving": partial(_draw_image, "moving"),
@@ -124,7 +161,7 @@ _PANELS: dict[str, Draw] = {
     "deformed grid": _draw_grid,
     "difference before": partial(_draw_difference, "before"),
     "difference after": partial(_draw_difference, "after"),
-    "volume: moving / fixed": _draw_volume,
+    _VOLUME: _draw_volume,
 }
 
 
@@ -138,13 +175,14 @@ def write_gallery(path: Path, images: Mapping[str, Image]) -> None:
     planes = [planes_of(image) for image in images.values()]
     width = _GALLERY_INCHES[next(iter(images.values())).grid.dim]
     heights = [width * max(plane.height_over_width for plane in row) for row in zip(*planes, strict=True)]
-    figure, cells = _sheet(width, len(images), heights, 0.3)
-    for column, (title, image) in enumerate(images.items()):
+    sheet = Sheet(width, len(images), heights, [TITLE, *[GAP] * (len(heights) - 1)])
+    for column, (name, image) in enumerate(images.items()):
         values = grey(image).float().cpu()
         for row, plane in enumerate(planes[column]):
-            draw_image(cells[row, column], plane, plane.cut(to_unit(values, values), [plane.middle])[0])
-        cells[0, column].set_title(title, fontsize=10, color=INK)
-    save_png(figure, path)
+            axes = sheet.panels[row][column]
+            draw_image(axes, plane, plane.cut(to_unit(values, values), [plane.middle])[0])
+        title(sheet.panels[0][column], shortened(name, int(14 * width)))
+    save_png(sheet.figure, path)
 
 
 @dataclass(frozen=True)
@@ -166,22 +204,22 @@ def write_overlay(path: Path, fixed: Image, moving: Image) -> None:
     """
     cuts = _cuts(fixed, moving)
     heights = [_OVERLAY_INCHES * min(2.0, max(0.4, cut.plane.height_over_width)) for cut in cuts]
-    figure, cells = _sheet(_OVERLAY_INCHES, 3, heights, 0.3 * len(cuts) + 0.5)
-    for row, cut in zip(cells, cuts, strict=True):
+    room = [TITLE, *[GAP] * (len(cuts) - 1)]
+    sheet = Sheet(_OVERLAY_INCHES, 3, heights, room, headlines=[_OVERLAY])
+    for row, cut in zip(sheet.panels, cuts, strict=True):
         _draw_row(row, cut, titled=cut is cuts[0])
-    figure.suptitle("fixed in blue, moving in orange, frames at their borders", fontsize=11, color=INK)
-    save_png(figure, path)
+    save_png(sheet.figure, path)
 
 
 def _draw_row(row: "Sequence[Axes]", cut: _Cut, *, titled: bool) -> None:
     pictures = {"fixed": cut.values[0], "moving": cut.values[1], "overlay": tinted(*cut.values)}
-    for axes, (title, picture) in zip(row, pictures.items(), strict=True):
+    for axes, (name, picture) in zip(row, pictures.items(), strict=True):
         axes.imshow(picture, cmap="gray", vmin=0, vmax=1, aspect=cut.plane.aspect)
         for inside, colour in zip(cut.inside, _OUTLINES, strict=True):
             if inside.any() and not inside.all():
                 axes.contour(inside.astype(np.float32), levels=[0.5], colors=[colour], linewidths=0.9)
         frame(axes, cut.plane)
-        axes.set_title(title if titled else "", fontsize=10, color=INK)
+        title(axes, name if titled else "")
 
 
 def _cuts(fixed: Image, moving: Image) -> list[_Cut]:

@@ -33,7 +33,7 @@ def write_grids(path: Path, grids: Mapping[str, Tensor], picture: Tensor | None 
     """
     dim = next(iter(grids.values())).shape[1]
     panels = len(grids) + (picture is not None)
-    figure = drawing.new_figure(panels * _PANEL[dim], _PANEL[dim])
+    figure = drawing.new_figure(panels * _PANEL[dim], _PANEL[dim], constrained=True)
     if picture is not None:
         axes = figure.add_subplot(1, panels, 1)
         draw_picture(axes, picture, next(iter(grids.values())), "image")

@@ -2,45 +2,56 @@
 
 import base64
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from torchdeform.metrics.similarity import measure_name
+from torchdeform.registration.verdict import MARKS
+from torchdeform.report.contours import Lines
 from torchdeform.report.drawing import (
+    LINES,
     Scale,
     difference_scale,
     draw_convergence,
     draw_volumes,
     length_scale,
+    moved_lines,
     rotation_scale,
     signed_scale,
     volume_scale,
 )
+from torchdeform.report.legend import legend
+from torchdeform.report.marks import ABSENT, REGIONS, WORST, Mark
+from torchdeform.report.planes import SIDES
 from torchdeform.report.record import describe
 from torchdeform.report.report_data import ReportData, Slices
+from torchdeform.report.sampling import FIXED, MOVING, ORIGINAL, WARPED
 from torchdeform.report.tables import command_lines, file_name, footer, tables, tiles
-from torchdeform.report.verdict import BAD, DOUBTFUL, GOOD, judge
 from torchdeform.report.web_images import (
     UNITS,
+    Bar,
     Frame,
+    bar_of,
     colours,
-    css_stops,
     curve,
     frame_of,
     grey_levels,
-    grid_paths,
     image_strip,
+    svg_paths,
 )
 
 _TEMPLATES = Path(__file__).parent / "templates"
-_MARKS = {GOOD: "✓", DOUBTFUL: "!", BAD: "✗"}
 _MODES = {"swipe": "swipe", "flicker": "flicker", "checkerboard": "checkerboard", "overlay": "two colours"}
 # Largest side of a slice in pixels and quality of its JPEG, from the best to one that always fits.
 _SIZES = {2: ((900, 88), (700, 80), (500, 70), (350, 50)), 3: ((256, 85), (224, 75), (192, 60), (144, 40))}
 _MOST = 4_200_000  # characters of all pictures together
-_GRID_LINES = {2: 40, 3: 28}
+_IMAGES_IN_ALL = 8  # about how many times the size of one image they have
+_GRID_LINES = {2: 40, 3: 20}
+_HATCHES = 80  # lines of a hatched area across a picture
+GRID = "grid"
+_SCRIPTED = ("positions", "labels", "start", "lines")  # what the page's script needs of a plane
 _CURVE_INCHES = (5.2, 2.5)
 
 
@@ -54,8 +65,8 @@ def write_report(path: Path, data: ReportData, record: Mapping[str, Any] | None 
     """
     known = describe(data.result, data.fixed, data.moving) if record is None else record
     page = _render(
-        verdict=judge(known),
-        marks=_MARKS,
+        verdict=known["verdict"],
+        marks=MARKS,
         modes=_MODES,
         fixed_name=file_name(known["fixed"]),
         moving_name=file_name(known["moving"]),
@@ -63,6 +74,7 @@ def write_report(path: Path, data: ReportData, record: Mapping[str, Any] | None 
         tables=tables(known),
         commands=command_lines(known),
         footer=footer(known),
+        worst=data.known.worst.reason,
         **fitting_pictures(data),
     )
     path.write_text(page, encoding="utf-8")
@@ -87,36 +99,49 @@ def _render(**context: object) -> str:
 
 
 @dataclass(frozen=True)
+class Line:
+    """Lines that are drawn over pictures, by plane a path for each slice."""
+
+    id: str
+    mark: Mark
+    paths: Mapping[str, list[str]]
+
+
+@dataclass(frozen=True)
 class Picture:
-    """One figure of the page with its caption: by plane, a strip of slices or the paths of a grid."""
+    """One figure of the page with its caption: by plane a strip of slices, or lines alone, and lines over them."""
 
     name: str
     title: str
     caption: str
     strips: Mapping[str, str] = field(default_factory=dict)
-    paths: Mapping[str, list[str]] = field(default_factory=dict)
-    bar: str = ""
-    ticks: tuple[Mapping[str, object], ...] = ()
-
-    @property
-    def size(self) -> int:
-        """Characters on the page."""
-        return sum(map(len, self.strips.values())) + sum(len(p) for paths in self.paths.values() for p in paths)
+    lines: Sequence[Line] = ()
+    bar: Bar | None = None
 
 
 def fitting_pictures(data: ReportData) -> dict[str, object]:
     """Return the template's values for the pictures of a registration, in the best quality that fits the page."""
-    for size in _SIZES[data.result.grid.dim]:
-        renderer = _Renderer(data, *size)
+    sizes = _SIZES[data.result.grid.dim]
+    frames = _frames(data, sizes[0][0])
+    lines = list(_lines(data, frames))
+    pictures: dict[str, list[Picture]] = {}
+    for size in sizes:
+        renderer = _Renderer(data, lines, *size)
+        if size is not sizes[-1] and renderer.likely_size() > _MOST:
+            continue
         pictures = renderer.pictures()
-        if sum(picture.size for group in pictures.values() for picture in group) <= _MOST:
+        if _size(lines, pictures) <= _MOST:
             break
-    planes = renderer.planes()
+    planes = [_plane(cuts, frame, lines) for cuts, frame in frames]
     return {
         "planes": planes,
         "wide": round(sum(plane["shape"] for plane in planes), 3),
-        "data": {plane["name"]: {key: plane[key] for key in ("positions", "labels")} for plane in planes},
+        "data": {plane["name"]: {key: plane[key] for key in _SCRIPTED} for plane in planes},
         "choices": [{"name": name, "title": title} for name, title in _others(data).items()],
+        "lines": lines,
+        "over_stage": [line for line in lines if line.mark.kind != GRID],
+        "legend": legend(data),
+        "hatch": UNITS * max(max(frame.down, frame.across) for _, frame in frames) // _HATCHES,
         "differences": pictures.pop("Differences"),
         "groups": pictures,
         "curves": _curves(data),
@@ -124,69 +149,98 @@ def fitting_pictures(data: ReportData) -> dict[str, object]:
     }
 
 
+def _frames(data: ReportData, largest: int) -> list[tuple[Slices, Frame]]:
+    return [(cuts, frame_of(cuts.plane, len(cuts.numbers), largest)) for cuts in data.slices]
+
+
+def _lines(data: ReportData, frames: Sequence[tuple[Slices, Frame]]) -> Iterator[Line]:
+    """Yield what is drawn over the slices, and the grid, the planes together."""
+    found: dict[Mark, dict[str, list[str]]] = {}
+    for cuts, frame in frames:
+        marks = dict(cuts.marks) if data.light else cuts.marks | {Mark(GRID, FIXED, LINES): _grids(cuts)}
+        for mark, lines in marks.items():
+            found.setdefault(mark, {})[cuts.plane.name] = svg_paths(lines, cuts.plane, frame)
+    for k, (mark, paths) in enumerate(found.items()):
+        yield Line(f"line-{k}", mark, paths)
+
+
+def _size(lines: Sequence[Line], pictures: Mapping[str, Sequence[Picture]]) -> int:
+    """Return the characters that pictures take on the page."""
+    paths = sum(len(path) for line in lines for paths in line.paths.values() for path in paths)
+    return paths + sum(len(strip) for group in pictures.values() for p in group for strip in p.strips.values())
+
+
 def _others(data: ReportData) -> dict[str, str]:
     """Return the images that can be compared with the fixed one, with their titles."""
     aligned = data.result.affine is not None
-    titles = {"warped": "warped", "moving": "moving, aligned" if aligned else "moving", "original": "moving, as it was"}
+    titles = {WARPED: "warped", MOVING: "moving, aligned" if aligned else "moving", ORIGINAL: "moving, as it was"}
     return {name: title for name, title in titles.items() if name in data.slices[0].fields}
 
 
 class _Renderer:
     """Makes the pictures in one size and quality."""
 
-    def __init__(self, data: ReportData, largest: int, quality: int) -> None:
-        self._data, self._quality = data, quality
-        self._parts = [(cuts, frame_of(cuts.plane, len(cuts.numbers), largest)) for cuts in data.slices]
+    def __init__(self, data: ReportData, lines: Sequence[Line], largest: int, quality: int) -> None:
+        self._data, self._all_lines, self._quality = data, lines, quality
+        self._parts = _frames(data, largest)
 
-    def planes(self) -> list[dict[str, Any]]:
-        """Return the figures of each plane that the page needs."""
-        return [_plane(cuts, frame) for cuts, frame in self._parts]
+    def likely_size(self) -> int:
+        """Return about how many characters everything takes, from the size of one image."""
+        return _size(self._all_lines, {}) + _IMAGES_IN_ALL * sum(map(len, self._strips(FIXED, None).values()))
 
     def pictures(self) -> dict[str, list[Picture]]:
         """Return all pictures, in groups."""
-        scale = difference_scale(self._data.limits["before"])
-        titles = {"fixed": "fixed", **_others(self._data)}
-        return {
-            "Differences": [
-                self._map("before", "Difference before the deformation", scale),
-                self._map("after", "Difference after it", scale),
-            ],
-            "Images": [
-                Picture(name, title.capitalize(), _CAPTIONS[name], self._strips(name, None))
-                for name, title in titles.items()
-            ],
-            "The map": list(self._maps()),
-        }
+        scale, light = difference_scale(self._data.limits["before"]), self._data.light
+        titles = {FIXED: "fixed", **_others(self._data)}
+        differences = [
+            self._map("before", "Difference before the deformation", scale, self._over(MOVING, *REGIONS, WORST)),
+            self._map("after", "Difference after it", scale, self._over(WARPED, *REGIONS, WORST)),
+        ]
+        images = [
+            Picture(name, title.capitalize(), _CAPTIONS[name], self._strips(name, None), self._over(name))
+            for name, title in titles.items()
+            if not light or name in (FIXED, WARPED)
+        ]
+        found = {"Differences": differences, "Images": images}
+        return found if light else found | {"The map": list(self._maps())}
+
+    def _over(self, image: str, *kinds: str) -> list[Line]:
+        """Return the lines that belong over an image: its own and those of the fixed one, of some kinds or all."""
+        return [
+            line
+            for line in self._all_lines
+            if line.mark.image in (FIXED, image) and (line.mark.kind in kinds if kinds else line.mark.kind != GRID)
+        ]
 
     def _maps(self) -> Iterator[Picture]:
         limits, dim = self._data.limits, self._data.result.grid.dim
-        paths = {cuts.plane.name: grid_paths(cuts, frame, _GRID_LINES[dim]) for cuts, frame in self._parts}
-        yield Picture("grid", "Deformed grid", _CAPTIONS["grid"], paths=paths)
-        yield self._map("log_det", "Volume: moving / fixed", volume_scale(limits["log_det"]))
+        yield Picture(GRID, "Deformed grid", _CAPTIONS[GRID], lines=self._over(FIXED, GRID))
+        size, scale = ("Area", "Volume")[dim - 2], volume_scale(limits["log_det"])
+        yield self._map("log_det", f"{size}: moving / fixed", scale, self._over(FIXED, ABSENT))
         yield self._map("divergence", "Divergence", signed_scale(limits["divergence"]))
         yield self._map(
             "rotation", "Curl" if dim == 2 else "Length of the curl", rotation_scale(limits["rotation"], dim)
         )
         yield self._map("inverse_error", "Inverse consistency", length_scale(limits["inverse_error"]))
 
-    def _map(self, name: str, title: str, scale: Scale) -> Picture:
+    def _map(self, name: str, title: str, scale: Scale, lines: Sequence[Line] = ()) -> Picture:
         """Return a picture in the colours of a scale."""
-        ticks = tuple(
-            {"place": round(100 * (value - scale.low) / (scale.high - scale.low), 2), "text": text}
-            for value, text in scale.ticks
-        )
-        return Picture(name, title, _CAPTIONS[name], self._strips(name, scale), bar=css_stops(scale), ticks=ticks)
+        caption = _CAPTIONS[name].format(**_WORDS[self._data.result.grid.dim])
+        return Picture(name, title, caption, self._strips(name, scale), lines, bar_of(scale))
 
     def _strips(self, name: str, scale: Scale | None) -> dict[str, str]:
-        """Return the slices of a field as data URIs, by plane."""
+        """Return the slices of a field as data URIs, by plane; those of the map, which is smooth, in half the size."""
         found = {}
         for cuts, frame in self._parts:
             values = cuts.fields[name]
             pixels = grey_levels(values) if scale is None else colours(values, scale)
-            found[cuts.plane.name] = image_strip(pixels, cuts.plane, frame, self._quality)
+            size = frame.half if name in _SMOOTH else frame
+            found[cuts.plane.name] = image_strip(pixels, cuts.plane, size, self._quality)
         return found
 
 
+_SMOOTH = ("log_det", "divergence", "rotation", "inverse_error")
+_WORDS = {2: {"voxel": "pixel", "volume": "area"}, 3: {"voxel": "voxel", "volume": "volume"}}
 _CAPTIONS = {
     "fixed": "The image that stays.",
     "warped": "The moving image after the map: it should look like the fixed one.",
@@ -195,23 +249,31 @@ _CAPTIONS = {
     "before": "|fixed − moving|: dark where both agree.",
     "after": "|fixed − warped|, in the same scale.",
     "grid": "Where points of the fixed image are in the moving one. Without folds lines never cross.",
-    "log_det": "Size of a piece of tissue in the moving image: 2 (orange) is twice the volume, 0.5 (purple) half.",
+    "log_det": "Size of a piece of tissue in the moving image: 2 (orange) is twice the {volume}, 0.5 (purple) half.",
     "divergence": "Divergence of the displacement: positive where the moving image is larger, negative where smaller.",
     "rotation": "Curl of the displacement: how much the map rotates.",
-    "inverse_error": "In voxels: how far a point is from itself after the map and its inverse.",
+    "inverse_error": "In {voxel}s: how far a point is from itself after the map and its inverse.",
 }
 
 
-def _plane(cuts: Slices, frame: Frame) -> dict[str, Any]:
-    positions = frame.positions
+def _grids(cuts: Slices) -> Sequence[Lines]:
+    """Return the deformed grid of every slice."""
+    count = _GRID_LINES[cuts.plane.grid.dim]
+    return [moved_lines(cuts.plane, u, count) for u in cuts.fields["u"]]
+
+
+def _plane(cuts: Slices, frame: Frame, lines: Sequence[Line]) -> dict[str, Any]:
+    positions, name = frame.positions, cuts.plane.name
     return {
-        "name": cuts.plane.name,
+        "name": name,
         "view": f"0 0 {UNITS * frame.across} {UNITS * frame.down}",
         "shape": round(frame.across / frame.down, 5),
-        "middle": cuts.middle,
+        "start": cuts.start,
         "positions": positions,
-        "position": positions[cuts.middle],
+        "position": positions[cuts.start],
         "labels": [f"slice {number + 1} of {cuts.plane.depth}" for number in cuts.numbers],
+        "letters": dict(zip(SIDES, cuts.plane.letters, strict=False)),
+        "lines": {line.id: line.paths[name] for line in lines if name in line.paths} if len(positions) > 1 else {},
     }
 
 
@@ -220,10 +282,11 @@ def _curves(data: ReportData) -> list[dict[str, object]]:
     from markupsafe import Markup
 
     limit, measure = data.limits["log_det"], measure_name(data.result.settings.similarity.measure)
-    about_volumes = "How often each change of volume occurs, over all voxels."
+    words = _WORDS[data.result.grid.dim]
+    about_volumes = "How often each change of {volume} occurs, over all {voxel}s.".format(**words)
     about_steps = f"Similarity ({measure}) over the steps, by level."
     curves = (
-        ("Volumes", about_volumes, lambda axes: draw_volumes(axes, data.volumes, limit)),
+        (f"{words['volume'].capitalize()}s", about_volumes, lambda axes: draw_volumes(axes, data.volumes, limit)),
         ("Convergence", about_steps, lambda axes: draw_convergence(axes, data.result)),
     )
     return [

@@ -8,20 +8,26 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image
+from torchdeform.core.image import Image, orientation
 from torchdeform.errors import InputError, require_choice
 
 PLANES = ("axial", "coronal", "sagittal")
+SIDES = ("left", "right", "top", "bottom")
+_OPPOSITE = dict(zip("LRPAIS", "RLAPSI", strict=True))
 
 
 @dataclass(frozen=True)
 class Plane:
-    """A way to cut a grid: the axes it shows (down, across), and which of them are flipped to the usual view."""
+    """A way to cut a grid: the axes it shows (down, across), and which of them are flipped to the usual view.
+
+    ``letters`` say which side of the body is at the left, right, top and bottom of the picture; empty in 2D.
+    """
 
     name: str
     grid: Grid
     axes: tuple[int, int]
     flipped: tuple[bool, bool]
+    letters: str = ""
 
     @property
     def through(self) -> int | None:
@@ -93,8 +99,13 @@ def planes_of(image: Image) -> list[Plane]:
     z, y, x = _axes_along_world(image)
     against = [image.direction[world][2 - axis] < 0 for world, axis in ((2, z), (1, y), (0, x))]
     flipped = dict(zip((z, y, x), (not against[0], against[1], against[2]), strict=True))
-    pairs = zip(PLANES, ((y, x), (z, x), (z, y)), strict=True)
-    return [Plane(name, image.grid, axes, (flipped[axes[0]], flipped[axes[1]])) for name, axes in pairs]
+    ends = orientation(image)[::-1]  # where each array axis points to
+    planes = []
+    for name, axes in zip(PLANES, ((y, x), (z, x), (z, y)), strict=True):
+        turned = (flipped[axes[0]], flipped[axes[1]])
+        bottom, right = (_OPPOSITE[ends[axis]] if turn else ends[axis] for axis, turn in zip(axes, turned, strict=True))
+        planes.append(Plane(name, image.grid, axes, turned, _OPPOSITE[right] + right + _OPPOSITE[bottom] + bottom))
+    return planes
 
 
 def chosen_plane(image: Image, name: str | None, index: int | None) -> tuple[Plane, int]:

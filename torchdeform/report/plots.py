@@ -16,13 +16,11 @@ from torchdeform.report import drawing
 from torchdeform.report.planes import Plane, chosen_plane
 from torchdeform.report.report_data import (
     end_of_scale,
-    grey,
     log_volume,
-    sample_at_fixed,
     signed_or_length,
-    to_unit,
     volume_counts,
 )
+from torchdeform.report.sampling import grey, sample_at_fixed, to_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -123,7 +121,7 @@ def plot_difference(fixed: Image, moving: Image, *, limit: float | None = None, 
     """
     axes, cut, first, second = _grey_slices(fixed, moving, **view)
     values = (first - second).abs()
-    drawing.draw_map(axes, cut, values, drawing.difference_scale(_limit(values, limit)))
+    _map_with_bar(axes, cut, values, drawing.difference_scale(_limit(values, limit)))
     return axes
 
 
@@ -340,5 +338,11 @@ def _log_determinant(u: Tensor, grid: Grid) -> tuple[Tensor, float]:
 def _plot_map(values: Tensor, place: Image, scale: drawing.Scale, **view: Unpack[View]) -> "Axes":
     """Draw a field ``(1, 1, *S)`` in a slice."""
     axes, cut, number = _view(place, **view)
-    drawing.draw_map(axes, cut, cut.cut(values, [number])[0], scale)
+    _map_with_bar(axes, cut, cut.cut(values, [number])[0], scale)
     return axes
+
+
+def _map_with_bar(axes: "Axes", cut: Plane, values: Tensor, scale: drawing.Scale) -> None:
+    """Draw a map, and the bar of its colours below."""
+    shown = drawing.draw_map(axes, cut, values, scale)
+    drawing.draw_bar(axes.inset_axes((0.15, -0.08, 0.7, 0.035)), shown, scale)

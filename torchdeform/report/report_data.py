@@ -2,43 +2,48 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchdeform.core.derivatives import CURL_PAIRS, by_slabs, determinant, jacobian
 from torchdeform.core.grid import Grid, over_slabs
-from torchdeform.core.image import Image, luminance
-from torchdeform.core.transform import Affine
+from torchdeform.core.image import Image
 from torchdeform.core.warp import sample, voxels
+from torchdeform.registration.problem import Annotations
 from torchdeform.registration.result import RegistrationResult
+from torchdeform.report.landmarks import landmarks_of
+from torchdeform.report.marks import Known, Marks, marks_of
+from torchdeform.report.places import Place, chosen_slices, slice_of, span, worst_place
 from torchdeform.report.planes import Plane, planes_of
+from torchdeform.report.sampling import FIXED, MOVING, WARPED, PairSampler, Sampled, grey, quantiles
 
-_PERCENTILES = (0.5, 99.5)
 _SCALE_END = 99.8  # percentile at which a scale ends
 _SMALLEST = 1e-3  # smaller determinants, also of folds, are drawn as this
 # The scales reach at least this far: to half and twice the volume, to half a voxel.
 _SHORTEST_SCALES = {"log_det": math.log(2), "inverse_error": 0.5}
 _BINS = 81
-_COLOURED = (3, 4)  # numbers of channels of colour pictures, without and with alpha
-_USED = 0.96  # share of an axis that slices are taken from: those at its ends show nothing
+_ALL = 130  # slices of all planes together that are shown if there are no more
+_MOST = 31  # slices of a plane otherwise
+_FEW = 5  # slices of a plane in a light report
 
 
 @dataclass(frozen=True)
 class Slices:
-    """Slices of one plane by the name of their field, each ``(n, C, n_down, n_across)``.
+    """Slices of one plane by the name of their field, each ``(n, C, n_down, n_across)``, and what is drawn over them.
 
     ``fixed``, ``warped``, ``moving`` (after the alignment) and, with an alignment, ``original`` (before it) are from 0
-    to 1; ``before`` and ``after`` are |fixed − moving| and |fixed − warped| in grey; ``u`` is in units of spacing;
-    ``log_det``, ``divergence``, ``rotation`` (the curl in 2D, its length in 3D) have no unit; ``inverse_error`` is
-    |φ(φ⁻¹(x)) − x| in voxels.
+    to 1; ``before`` and ``after`` are |fixed − moving| and |fixed − warped| in grey, NaN outside of the moving image;
+    ``u`` is in units of spacing; ``log_det``, ``divergence``, ``rotation`` (the curl in 2D, its length in 3D) have no
+    unit; ``inverse_error`` is |φ(φ⁻¹(x)) − x| in voxels. ``start`` is the position of the slice to show first.
     """
 
     plane: Plane
     numbers: tuple[int, ...]
     fields: dict[str, Tensor]
+    marks: Marks = field(default_factory=dict)
+    start: int = 0
 
     @property
     def middle(self) -> int:
@@ -55,8 +60,10 @@ class ReportData:
         fixed: fixed image.
         moving: moving image, at its own position.
         result: what the registration returned.
-        limits: where the scale of each field ends, by its name.
+        limits: where the scale of each field ends, by its name, and that of the landmarks.
         volumes: histogram of log J between −limit and limit, in nodes.
+        known: what is drawn besides the images.
+        light: whether the page leaves out the pictures of the map.
     """
 
     slices: tuple[Slices, ...]
@@ -65,42 +72,103 @@ class ReportData:
     result: RegistrationResult
     limits: dict[str, float]
     volumes: Tensor
+    known: Known
+    light: bool = False
 
 
-def make_report_data(fixed: Image, moving: Image, result: RegistrationResult, *, slices: int = 15) -> ReportData:
+def make_report_data(
+    fixed: Image,
+    moving: Image,
+    result: RegistrationResult,
+    *,
+    annotations: Annotations | None = None,
+    slices: int | None = None,
+    light: bool = False,
+) -> ReportData:
     """Return the data of all pictures of a registration.
 
     Args:
         fixed: fixed image.
         moving: moving image, at its own position.
         result: a result of one pair (batch of 1) on the fixed grid.
-        slices: number of slices of each plane at most, at equal distances, with the middle one.
+        annotations: labels, landmarks and masks to draw, those that were given to `register`.
+        slices: number of slices of each plane, at equal distances. When None, all that show something, or 31 of them.
+            The middle one and that with the worst place are always among them.
+        light: for a small page: few slices, no pictures of the map.
 
     Returns:
         `ReportData`, on the CPU.
     """
-    fixed, moving = fixed.to("cpu"), moving.to("cpu")
-    fields = derivative_fields(result.displacement.detach().cpu(), fixed.grid)
+    given = (annotations or Annotations()).to("cpu")
+    sampler = PairSampler(fixed.to("cpu"), moving.to("cpu"), result, given)
+    fields = derivative_fields(sampler.u, fixed.grid)
     fields["log_det"] = log_volume(fields.pop("determinant"))
-    sampler = _SliceSampler(fixed, moving, result)
-    stacks = []
-    for plane in planes_of(fixed):
-        numbers = evenly_spaced(plane, slices)
-        stacks.append(Slices(plane, numbers, sampler.sample(plane, numbers) | _cut(fields, plane, numbers)))
-    limits = _limits(fields, stacks)
-    return ReportData(tuple(stacks), fixed, moving, result, limits, volume_counts(fields["log_det"], limits["log_det"]))
+    known = _known(sampler, result, given)
+    most = _FEW if light and slices is None else slices
+    stacks = [
+        _slices(sampler, result, fields, known, plane, numbers)
+        for plane, numbers in _numbers(sampler.fixed, known.worst, most).items()
+    ]
+    limits = _limits(fields, stacks) | {"landmarks": known.limit}
+    volumes = volume_counts(fields["log_det"], limits["log_det"])
+    return ReportData(tuple(stacks), sampler.fixed, sampler.moving, result, limits, volumes, known, light)
 
 
-def evenly_spaced(plane: Plane, count: int) -> tuple[int, ...]:
-    """Return at most ``count`` slices of a plane at equal distances, with the middle one, without the outermost."""
-    reach = (plane.depth - 1) * _USED / 2
-    half = (count - 1) // 2
-    steps = [plane.middle + round(reach * k / max(half, 1)) for k in range(-half, half + 1)]
-    return tuple(sorted({min(max(k, 0), plane.depth - 1) for k in steps}))
+def _known(sampler: PairSampler, result: RegistrationResult, annotations: Annotations) -> Known:
+    """Return what is drawn besides the images."""
+    absent = getattr(result, "absent", None)
+    absent = None if absent is None else absent.detach().cpu()
+    landmarks = landmarks_of(sampler.fixed, result, annotations)
+    return Known(worst_place(sampler, landmarks, absent), landmarks, absent)
 
 
-def _cut(fields: dict[str, Tensor], plane: Plane, numbers: Sequence[int]) -> dict[str, Tensor]:
-    return {name: plane.cut(field, numbers) for name, field in fields.items()}
+def _numbers(fixed: Image, worst: Place, most: int | None) -> dict[Plane, tuple[int, ...]]:
+    """Return the slices to show of each plane."""
+    picture = grey(fixed)
+    ends = {plane: (0, 0) if plane.through is None else span(picture, plane.through) for plane in planes_of(fixed)}
+    if most is None:
+        every = sum(last - first + 1 for first, last in ends.values())
+        most = every if every <= _ALL else _MOST
+    return {
+        plane: chosen_slices(plane, reach, most, (plane.middle, slice_of(plane, worst)))
+        for plane, reach in ends.items()
+    }
+
+
+def _slices(
+    sampler: PairSampler,
+    result: RegistrationResult,
+    fields: dict[str, Tensor],
+    known: Known,
+    plane: Plane,
+    numbers: tuple[int, ...],
+) -> Slices:
+    sampled = {name: sampler.at_slices(name, plane, numbers) for name in (FIXED, *sampler.stages)}
+    shown = _images(sampled)
+    shown |= {name: plane.cut(field, numbers) for name, field in {"u": sampler.u, **fields}.items()}
+    shown["inverse_error"] = _inverse_error(result.inverse.detach().cpu(), sampler.u, plane, numbers)
+    marks = marks_of(plane, numbers, sampled, known)
+    return Slices(plane, numbers, shown, marks, numbers.index(slice_of(plane, known.worst)))
+
+
+def _images(sampled: dict[str, Sampled]) -> dict[str, Tensor]:
+    """Return the images, and the differences of the moving one where it has values."""
+    fixed, moving, warped = (sampled[name] for name in (FIXED, MOVING, WARPED))
+    return {name: image.colours for name, image in sampled.items()} | {
+        "before": (moving.grey - fixed.grey).abs().where(moving.inside, torch.nan),
+        "after": (warped.grey - fixed.grey).abs().where(warped.inside, torch.nan),
+    }
+
+
+def _inverse_error(inverse: Tensor, u: Tensor, plane: Plane, numbers: Sequence[int]) -> Tensor:
+    """Return |w(x) + u(x + w(x))| in voxels."""
+    points, back = plane.points(numbers), plane.chosen(inverse, numbers)
+
+    def error(rows: slice) -> Tensor:
+        part = back[:, :, rows]
+        return voxels(part + sample(u, points[:, :, rows] + part, plane.grid), plane.grid)
+
+    return plane.arrange(over_slabs(error, points.shape[2:], points.device))
 
 
 def _limits(fields: dict[str, Tensor], stacks: list[Slices]) -> dict[str, float]:
@@ -108,67 +176,6 @@ def _limits(fields: dict[str, Tensor], stacks: list[Slices]) -> dict[str, float]
     shown = {name: torch.cat([s.fields[name].flatten() for s in stacks]) for name in ("before", "inverse_error")}
     limits = {name: end_of_scale(values, _SHORTEST_SCALES.get(name, 1e-3)) for name, values in (fields | shown).items()}
     return limits | {"after": limits["before"]}
-
-
-class _SliceSampler:
-    """Samples the images and maps of a pair at the points of slices only."""
-
-    def __init__(self, fixed: Image, moving: Image, result: RegistrationResult) -> None:
-        self._fixed, self._moving, self._affine = fixed, moving, result.affine
-        self._u, self._inverse = result.displacement.detach().cpu(), result.inverse.detach().cpu()
-        warped = replace(moving, data=result.warped.detach().cpu().float(), grid=fixed.grid)
-        greys = grey(fixed), grey(moving)
-        self._grey = greys[1]
-        self._on_grid = {
-            "fixed": to_unit(fixed.data, fixed.data),
-            "warped": to_unit(warped.data, moving.data),
-            "grey": to_unit(greys[0], greys[0]),
-            "after": to_unit(grey(warped), greys[1]),
-            "u": self._u,
-        }
-
-    def sample(self, plane: Plane, numbers: Sequence[int]) -> dict[str, Tensor]:
-        """Return slices of the images, the differences, the displacement and the inverse consistency."""
-        points = plane.points(numbers)
-        found = _cut(self._on_grid, plane, numbers)
-        fixed = found.pop("grey")
-        found["moving"], before = self._sampled(plane, points, self._affine)
-        if self._affine is not None:
-            found["original"], _ = self._sampled(plane, points, None)
-        return found | {
-            "before": (before - fixed).abs(),
-            "after": (found["after"] - fixed).abs(),
-            "inverse_error": self._error(plane, points, numbers),
-        }
-
-    def _sampled(self, plane: Plane, points: Tensor, affine: Affine | None) -> tuple[Tensor, Tensor]:
-        """Return the moving image in slices, in its colours and in grey."""
-        both = torch.cat((self._moving.data, self._grey), dim=1)
-        values = sample_at_fixed(both, self._moving, self._fixed, points, affine)
-        colours, grey_values = to_unit(values[:, :-1], self._moving.data), to_unit(values[:, -1:], self._grey)
-        return plane.arrange(colours), plane.arrange(grey_values)
-
-    def _error(self, plane: Plane, points: Tensor, numbers: Sequence[int]) -> Tensor:
-        """Return |w(x) + u(x + w(x))| in voxels."""
-        back = plane.chosen(self._inverse, numbers)
-
-        def error(rows: slice) -> Tensor:
-            part = back[:, :, rows]
-            return voxels(part + sample(self._u, points[:, :, rows] + part, plane.grid), plane.grid)
-
-        return plane.arrange(over_slabs(error, points.shape[2:], points.device))
-
-
-def sample_at_fixed(values: Tensor, image: Image, fixed: Image, points: Tensor, affine: Affine | None = None) -> Tensor:
-    """Return values on an image's grid at points of the fixed grid, mapped by ``affine``; 0 outside the image."""
-    values = values.float()
-
-    def at(rows: slice) -> Tensor:
-        world = fixed.to_world(points[:, :, rows])
-        place = image.to_grid(world if affine is None else affine(world))
-        return sample(values, place, image.grid, outside=0.0)
-
-    return over_slabs(at, points.shape[2:], points.device)
 
 
 def log_volume(det: Tensor) -> Tensor:
@@ -184,29 +191,6 @@ def volume_counts(log_det: Tensor, limit: float) -> Tensor:
 def end_of_scale(values: Tensor, least: float) -> float:
     """Return the percentile of |values| at which their scale ends, at least ``least``."""
     return max(quantiles(values.abs(), _SCALE_END)[0], least)
-
-
-def to_unit(values: Tensor, scale: Tensor) -> Tensor:
-    """Return values with the dark and bright ends of ``scale`` at 0 and 1, one scale for all colours, without alpha.
-
-    Of channels that are no colours the first is used. NaN becomes 0.
-    """
-    colours = slice(0, 3) if scale.shape[1] in _COLOURED else slice(0, 1)
-    low, high = quantiles(scale[:, colours], *_PERCENTILES)
-    return ((values[:, colours] - low) / max(high - low, 1e-12)).clamp(0, 1).nan_to_num(0.0)
-
-
-def grey(image: Image) -> Tensor:
-    """Return the luminance of a colour picture, else the first channel, ``(1, 1, *S)``."""
-    return luminance(image).data if image.data.shape[1] in _COLOURED else image.data[:, :1]
-
-
-def quantiles(values: Tensor, *percent: float) -> list[float]:
-    """Return percentiles of the finite values, of at most a million of them at regular steps."""
-    flat = values.reshape(-1)
-    some = flat[:: 1 + flat.numel() // 2**20]
-    finite = some[some.isfinite()].cpu()
-    return [float(q) for q in np.percentile(finite.numpy(), percent)] if len(finite) else [0.0] * len(percent)
 
 
 def derivative_fields(u: Tensor, grid: Grid) -> dict[str, Tensor]:

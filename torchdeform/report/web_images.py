@@ -3,7 +3,7 @@
 import base64
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,16 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchdeform.report.drawing import INK, Scale, moved_lines
+from torchdeform.report.drawing import INK, Scale
 from torchdeform.report.planes import Plane
-from torchdeform.report.report_data import Slices
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MARGIN = 4  # rows repeated above and below a slice, so that smoothing in a browser does not mix neighbours
+_MARGIN = 4  # rows repeated above and below a slice, so that smoothing in a browser does not mix neighbours; even
 _FEWEST = 160  # pixels of the longer side of a slice at least: in fewer the blocks of a JPEG are visible
 _STOPS = 16  # colours of a bar
+_FLAT = 0.5  # SVG units that a point is off the line between its neighbours where this counts as straight
+_STRAIGHT = 5
+_CURVE = (0.11, 0.19, 0.87, 0.77)  # where the axes of a curve are in its figure
 UNITS = 4  # SVG units per pixel
 
 Bytes = NDArray[np.uint8]
@@ -33,17 +35,23 @@ class Frame:
     down: int
     across: int
     slices: int
+    margin: int = _MARGIN
 
     @property
     def pitch(self) -> int:
         """Rows from one slice to the next."""
-        return self.down + 2 * _MARGIN
+        return self.down + 2 * self.margin
+
+    @property
+    def half(self) -> "Frame":
+        """The frame with half as many pixels down and across: its slices are at the same positions."""
+        return Frame(self.down // 2, self.across // 2, self.slices, self.margin // 2)
 
     @property
     def positions(self) -> list[float]:
         """The vertical object-position of each slice for CSS, in percent."""
         room = self.slices * self.pitch - self.down
-        return [round(100 * (k * self.pitch + _MARGIN) / room, 4) for k in range(self.slices)]
+        return [round(100 * (k * self.pitch + self.margin) / room, 4) for k in range(self.slices)]
 
 
 def frame_of(plane: Plane, slices: int, largest: int) -> Frame:
@@ -51,7 +59,7 @@ def frame_of(plane: Plane, slices: int, largest: int) -> Frame:
     extent = [n * plane.grid.spacing[axis] for n, axis in zip(plane.shape, plane.axes, strict=True)]
     finest = min(plane.grid.spacing[axis] for axis in plane.axes)
     pixels = min(max(max(extent) / finest, _FEWEST), largest)
-    down, across = (max(8, round(side / max(extent) * pixels)) for side in extent)
+    down, across = (2 * max(4, round(side / max(extent) * pixels / 2)) for side in extent)
     return Frame(down, across, slices)
 
 
@@ -66,7 +74,22 @@ def colours(values: Tensor, scale: Scale) -> Bytes:
     return _table(scale)[place.round().byte().numpy()]
 
 
-def css_stops(scale: Scale) -> str:
+@dataclass(frozen=True)
+class Bar:
+    """A colour bar for CSS: the stops of a gradient, and ticks with their place in percent."""
+
+    stops: str
+    ticks: tuple[Mapping[str, object], ...]
+
+
+def bar_of(scale: Scale) -> Bar:
+    """Return the colour bar of a scale."""
+    width = scale.high - scale.low
+    ticks = ({"place": round(100 * (value - scale.low) / width, 2), "text": text} for value, text in scale.ticks)
+    return Bar(_css_stops(scale), tuple(ticks))
+
+
+def _css_stops(scale: Scale) -> str:
     """Return a scale's colours as the stops of a CSS gradient."""
     chosen = _table(scale)[np.linspace(0, 255, _STOPS).round().astype(int)]
     return ", ".join(f"#{r:02x}{g:02x}{b:02x}" for r, g, b in chosen)
@@ -83,9 +106,12 @@ def image_strip(pixels: Bytes, plane: Plane, frame: Frame, quality: int) -> str:
     from PIL import Image as Picture
 
     shown = pixels[:, :: -1 if plane.flipped[0] else 1, :: -1 if plane.flipped[1] else 1]
-    rows = [np.asarray(_resized(flat.squeeze(-1) if flat.shape[-1] == 1 else flat, frame)) for flat in shown]
-    padding = ((_MARGIN, _MARGIN), (0, 0), (0, 0))
-    sheet = np.concatenate([np.pad(row, padding[: row.ndim], mode="edge") for row in rows])
+    first, last = frame.margin, frame.margin + frame.down
+    sheet = np.empty((len(shown), frame.pitch, frame.across, *([3] if shown.shape[-1] == 3 else [])), np.uint8)
+    for rows, flat in zip(sheet, shown, strict=True):
+        rows[first:last] = _resized(flat.squeeze(-1) if flat.shape[-1] == 1 else flat, frame)
+        rows[:first], rows[last:] = rows[first], rows[last - 1]
+    sheet = sheet.reshape(-1, *sheet.shape[2:])
     file = io.BytesIO()
     Picture.fromarray(sheet).save(file, "JPEG", quality=quality, optimize=True)
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
@@ -99,28 +125,55 @@ def _resized(flat: Bytes, frame: Frame) -> Bytes:
     return np.asarray(picture if picture.size == size else picture.resize(size, Picture.Resampling.BILINEAR))
 
 
-def grid_paths(cuts: Slices, frame: Frame, count: int) -> list[str]:
-    """Return the deformed grid of every slice as the d of an SVG path, with `UNITS` units per pixel of the frame."""
-    return [_path(moved_lines(cuts.plane, u, count), cuts.plane, frame) for u in cuts.fields["u"]]
+def svg_paths(slices: Sequence[Sequence[NDArray[np.floating]]], plane: Plane, frame: Frame) -> list[str]:
+    """Return the lines of every slice as the d of an SVG path, with `UNITS` units per pixel of the frame.
 
+    Args:
+        slices: of each slice the lines, each ``(m, 2)`` as (across, down) in nodes, m at least 2.
+        plane: the plane.
+        frame: its frame.
 
-def _path(lines: Sequence[NDArray[np.floating]], plane: Plane, frame: Frame) -> str:
+    Notes:
+        Points are left out where lines are straight or nodes denser than pixels.
+    """
+    lines = [line for some in slices for line in some]
+    if not lines:
+        return ["" for _ in slices]
     down, across = plane.shape
     size = np.array((UNITS * frame.across / across, UNITS * frame.down / down))
-    parts = []
-    for line in lines:
-        shown = np.where(plane.flipped[::-1], np.array((across, down)) - 1 - line, line)
-        steps = _thinned(((shown + 0.5) * size).round().astype(int))
-        parts.append("M" + "l".join(f"{x} {y}" for x, y in steps.tolist()))
-    return "".join(parts).replace(" -", "-")
+    counts, points = np.array([len(line) for line in lines]), np.concatenate(lines)
+    shown = (np.where(plane.flipped[::-1], np.array((across, down)) - 1 - points, points) + 0.5) * size
+    kept = _kept(shown, counts, max(1, round(2 * UNITS / float(size.min()))))
+    steps = shown[kept].round().astype(np.int64)
+    stops = np.cumsum(np.add.reduceat(kept, np.cumsum(counts) - counts)).tolist()
+    starts = [0, *stops[:-1]]
+    firsts = _pairs(steps[starts])
+    steps[1:] -= steps[:-1].copy()
+    pairs = _pairs(steps)
+    texts = iter(
+        f"M{first}l" + " ".join(pairs[start + 1 : stop])
+        for first, start, stop in zip(firsts, starts, stops, strict=True)
+    )
+    return ["".join(next(texts) for _ in some).replace(" -", "-") for some in slices]
 
 
-def _thinned(points: NDArray[np.int_]) -> NDArray[np.int_]:
-    """Return the first point and the steps between points, about one per two pixels."""
-    length = np.abs(np.diff(points, axis=0)).max(1).sum() if len(points) > 1 else 0
-    every = max(1, round(2 * UNITS * len(points) / max(length, 1)))
-    kept = points[np.unique(np.append(np.arange(0, len(points), every), len(points) - 1))]
-    return np.concatenate((kept[:1], np.diff(kept, axis=0)))
+def _pairs(points: NDArray[np.int64]) -> list[str]:
+    return [f"{x} {y}" for x, y in zip(points[:, 0].tolist(), points[:, 1].tolist(), strict=True)]
+
+
+def _kept(points: NDArray[np.floating], counts: NDArray[np.int64], every: int) -> NDArray[np.bool_]:
+    """Return which points of lines one after another are kept.
+
+    These are the first and the last of each, one of so many, of these again one of `_STRAIGHT` where they are on a
+    straight line.
+    """
+    ends = np.cumsum(counts)
+    place = np.arange(ends[-1]) - np.repeat(ends - counts, counts)
+    before, after = (np.roll(points, shift, axis=0) for shift in (every, -every))
+    off = np.abs(points - (before + after) / 2).max(1) > _FLAT
+    kept = (place % every == 0) & (off | (place % (_STRAIGHT * every) == 0))
+    kept[ends - 1] = True
+    return kept
 
 
 def curve(name: str, draw: Callable[["Axes"], None], width: float, height: float) -> str:
@@ -137,8 +190,8 @@ def curve(name: str, draw: Callable[["Axes"], None], width: float, height: float
     from matplotlib.figure import Figure
 
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
-        figure = Figure((width, height), layout="tight", facecolor="none")
-        axes = figure.add_subplot(facecolor="none")
+        figure = Figure((width, height), facecolor="none")
+        axes = figure.add_axes(_CURVE, facecolor="none")
         draw(axes)
         for spine in axes.spines.values():
             spine.set_color(INK)

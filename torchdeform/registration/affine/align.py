@@ -53,6 +53,7 @@ class Alignment:
         start: name of the start from which it was found.
         seconds: wall time.
         warnings: sentences about what looks wrong.
+        mirror: merit of the best mirrored map over that of the best map, on the coarsest level; 0 if none was tried.
     """
 
     affine: Affine
@@ -61,6 +62,7 @@ class Alignment:
     start: str
     seconds: float
     warnings: tuple[str, ...] = ()
+    mirror: float = 0.0
 
 
 @torch.no_grad()
@@ -122,6 +124,7 @@ def align(
         best.name,
         perf_counter() - began,
         _warnings(objectives[-1], best, found, (fixed.name, moving.name)),
+        found.mirror,
     )
 
 
@@ -134,8 +137,9 @@ def _optimise_levels(
     for index, objective in enumerate(objectives):
         if index == 1 or not candidates:
             candidates = [*candidates, identity]
-        if index >= _LEVELS_OF_SEVERAL:
-            candidates = candidates[:1]  # the most similar on the level before
+        if index >= _LEVELS_OF_SEVERAL:  # only one goes on, which details decide
+            values, _ = objective.values(torch.stack([candidate.map for candidate in candidates]))
+            candidates = [candidates[int(values.argmax())]]
         shortest = _SHORTEST_AT_LAST if objective is objectives[-1] else _SHORTEST
         found = optimised(objective, candidates, moves, settings.steps, shortest)
         candidates = [candidate for candidate in found if candidate.value > -math.inf]

@@ -14,7 +14,8 @@
   const showSlice = (plane, k) => {
     document.body.style.setProperty(`--at-${plane}`, `${data[plane].positions[k]}%`);
     all(`output[data-plane="${plane}"]`).forEach((output) => { output.textContent = data[plane].labels[k]; });
-    all(`path[data-plane="${plane}"]`).forEach((path, i) => path.toggleAttribute("hidden", i !== k));
+    Object.entries(data[plane].lines).forEach(([id, paths]) =>
+      document.getElementById(`${id}-${plane}`).setAttribute("d", paths[k]));
   };
   all(".slice-number").forEach((input) => {
     const show = () => {
@@ -23,6 +24,20 @@
     };
     input.addEventListener("input", show);
     show();
+  });
+
+  const sliders = all(".slice-number");
+  const worst = document.getElementById("worst");
+  if (worst) worst.addEventListener("click", () => sliders.forEach((input) => {
+    input.value = data[input.dataset.plane].start;
+    input.dispatchEvent(new Event("input"));
+  }));
+
+  // What is drawn over the images is shown or hidden by kind.
+  all("input[name=shown]").forEach((input) => {
+    const draw = () => document.body.classList.toggle(`no-${input.value}`, !input.checked);
+    input.addEventListener("change", draw);
+    draw();
   });
 
   // Flicker: by itself, unless the person wants less motion, or by hand.
@@ -39,6 +54,9 @@
   const other = (input) => {
     all(".above img").forEach((image) => { image.dataset.copy = input.value; fill(image); });
     all(".other-title").forEach((title) => { title.textContent = input.dataset.title; });
+    all(".stage use").forEach((use) => {
+      use.toggleAttribute("hidden", !["fixed", input.value].includes(use.dataset.image));
+    });
   };
 
   const swipe = document.getElementById("swipe");
