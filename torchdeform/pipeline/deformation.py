@@ -31,7 +31,7 @@ from torchdeform.io.files import atomic_folder, require_writable
 from torchdeform.io.images import ending_like, read_optional
 from torchdeform.report.grids import write_grids
 from torchdeform.report.record import describe_map, versions, write_json
-from torchdeform.report.report_data import grey, to_unit
+from torchdeform.report.sampling import grey, to_unit
 from torchdeform.solvers.base import Status
 
 MonitorName = Literal["gradient", "curvature", "density", "value"]

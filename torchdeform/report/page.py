@@ -22,7 +22,7 @@ from torchdeform.report.drawing import (
     volume_scale,
 )
 from torchdeform.report.legend import legend
-from torchdeform.report.marks import ABSENT, REGIONS, WORST, Mark
+from torchdeform.report.marks import ABSENT, NO_DATA, REGIONS, WORST, Mark
 from torchdeform.report.planes import SIDES
 from torchdeform.report.record import describe
 from torchdeform.report.report_data import ReportData, Slices
@@ -140,7 +140,10 @@ def fitting_pictures(data: ReportData) -> dict[str, object]:
         "data": {plane["name"]: {key: plane[key] for key in _SCRIPTED} for plane in planes},
         "choices": [{"name": name, "title": title} for name, title in _others(data).items()],
         "lines": lines,
-        "over_stage": [line for line in lines if line.mark.kind != GRID],
+        "stage_lines": {
+            "above": [line for line in lines if line.mark.kind == NO_DATA],  # part of the image that is compared
+            "over": [line for line in lines if line.mark.kind not in (GRID, NO_DATA)],
+        },
         "legend": legend(data),
         "hatch": UNITS * max(max(frame.down, frame.across) for _, frame in frames) // _HATCHES,
         "differences": pictures.pop("Differences"),
