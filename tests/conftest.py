@@ -85,6 +85,7 @@ def smooth_image(
     tilted: bool = False,
     name: str = "image",
     pixel_type: str = "float32",
+    unit: str = "mm",
 ) -> Image:
     """Return an image between 0 and 200 whose value depends on the world position only, so any grid may sample it."""
     dim = len(shape)
@@ -93,7 +94,7 @@ def smooth_image(
     place = Image(empty, grid, origin or (), _TILTED[dim] if tilted else (), name, pixel_type)
     world = place.to_world(grid.points(dtype=torch.float64))
     values = [_blobs(world, phase) for phase in range(channels)]
-    return Image(torch.cat(values, dim=1).float(), grid, place.origin, place.direction, name, pixel_type)
+    return Image(torch.cat(values, dim=1).float(), grid, place.origin, place.direction, name, pixel_type, unit)
 
 
 @pytest.fixture

@@ -136,7 +136,7 @@ RECORDS = {
     "check fixed.nii.gz moving.nii.gz": {"fixed", "moving", "findings", "picture"},
     "check fixed.nii.gz moving.nii.gz --out o.png": {"fixed", "moving", "findings", "picture"},
     "jacobian transform.h5 --out j.nii.gz": {"determinant_min", "determinant_max", "determinant_mean", "folds", "out"},
-    "invert transform.h5 --out i.h5": {"inverse_error_mean_mm", "inverse_error_max_mm", "out"},
+    "invert transform.h5 --out i.h5": {"inverse_error_mean", "inverse_error_max", "out"},
     "grid fixed.nii.gz --out g": {"folds", "determinant_error_mean", "out"},
     "reconstruct displacement.nii.gz --out r": {"distance_max", "out"},
     "simulate labels.png --labels labels.png --volume 1=0.9 --out s": {"volumes", "out"},

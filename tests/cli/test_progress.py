@@ -1,9 +1,14 @@
 """What a run of a cohort says on the way: a line a pair, failures always, and how long it will take."""
 
-import pytest
+import time
 
-from torchdeform.cli.progress import CohortProgress
+import pytest
+import torch
+
+from torchdeform.cli.progress import CohortProgress, StepProgress
 from torchdeform.cohort.run import Event
+from torchdeform.core.stages import begin
+from torchdeform.registration.result import Progress as Step
 
 START = Event("begin", "", "", 0.0, 0, 0, 4, 1, 0.0)
 EVENTS = [
@@ -27,11 +32,16 @@ def test_every_pair_has_a_line_and_failures_are_always_told(capsys, quiet):
     assert len(err.splitlines()) == (1 if quiet else 3)
 
 
-def test_a_terminal_gets_a_bar_with_counts_and_rate(capsys, monkeypatch):
-    monkeypatch.setenv("FORCE_COLOR", "1")  # makes rich believe in a terminal
+@pytest.fixture
+def terminal(monkeypatch):
+    """Make rich believe in a terminal."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm")
+
+
+def test_a_terminal_gets_a_bar_with_counts_and_rate(terminal, capsys):
     with CohortProgress() as progress:
         for event in EVENTS[:4]:
             progress.show(event)
@@ -39,3 +49,35 @@ def test_a_terminal_gets_a_bar_with_counts_and_rate(capsys, monkeypatch):
     err = capsys.readouterr().err
     assert "c failed" in err
     assert "3/4, 1 failed, 40.0 per min" in err
+
+
+def test_every_stage_of_a_registration_has_its_name_and_the_bar_grows(terminal, capsys):
+    steps = [Step(level, 3, step, 2, torch.tensor([0.5]), (30, 40)) for level in range(3) for step in (1, 2)]
+    with StepProgress() as bar:
+        seen = [_seen(bar)]
+        for stage in ("reading", "aligning", *steps, "inverting", "writing", "drawing"):
+            begin(stage) if isinstance(stage, str) else bar.show(stage)
+            seen.append(_seen(bar))
+            bar._progress.refresh()
+    titles, shares = zip(*seen, strict=True)
+    assert list(dict.fromkeys(titles)) == [
+        "reading", "aligning", *(f"level {k}/3 30×40" for k in (1, 2, 3)), "inverting", "writing", "drawing"
+    ]  # fmt: skip
+    assert list(shares) == sorted(shares)
+    assert shares[-1] < 1  # there is something to do until the end
+    assert "level 2/3 30×40" in capsys.readouterr().err
+
+
+def test_the_clock_runs_while_one_stage_computes(terminal, capsys):
+    with StepProgress() as bar:
+        begin("aligning")
+        end = time.monotonic() + 1.5
+        while time.monotonic() < end:  # computes, and never calls the bar
+            torch.ones(300, 300) @ torch.ones(300, 300)
+        assert bar._progress.tasks[0].elapsed > 1
+    assert "0:00:01" in capsys.readouterr().err
+
+
+def _seen(bar):
+    task = bar._progress.tasks[0]
+    return task.description, task.completed

@@ -104,9 +104,48 @@ def test_a_second_run_replaces_its_own_files_only(folder, engine):
     assert main(["fixed.png", "moving.png", "--out", "out", "--quiet"]) == 0
     (folder / "out" / "notes.txt").write_text("mine", encoding="utf-8")
     write_image(read_image("moving.png"), "moving.tif")
-    assert main(["fixed.png", "moving.tif", "--out", "out", "--quiet"]) == 0
+    assert main(["fixed.png", "moving.tif", "--out", "out", "--overwrite", "--quiet"]) == 0
     assert _names(folder / "out") == sorted([*RESULTS, "warped.tif", "notes.txt"])
     assert (folder / "out" / "notes.txt").read_text(encoding="utf-8") == "mine"
+
+
+@pytest.mark.parametrize(
+    "other", [("moving.png", "fixed.png"), ("fixed.png", "fixed.png"), ("fixed.nii.gz", "moving.nii.gz")]
+)
+def test_results_of_another_pair_are_kept_unless_told_otherwise(folder, engine, capsys, other):
+    assert main(["fixed.png", "moving.png", "--out", "out", "--quiet"]) == 0
+    before = {p.name: p.read_bytes() for p in (folder / "out").iterdir()}
+    said = _fails(capsys, 2, *other, "--out", "out")
+    assert "out has the results of moving.png to fixed.png" in said
+    assert "--overwrite" in said
+    assert {p.name: p.read_bytes() for p in (folder / "out").iterdir()} == before
+    assert main([*other, "--out", "out", "--overwrite", "--quiet"]) == 0
+
+
+def test_a_pair_is_the_same_from_wherever_it_is_named(folder, engine, monkeypatch):
+    assert main(["fixed.png", "moving.png", "--out", "out", "--quiet"]) == 0
+    (folder / "below").mkdir()
+    monkeypatch.chdir(folder / "below")
+    assert main(["../fixed.png", str(folder / "moving.png"), "--out", "../out", "--preset", "fast", "--quiet"]) == 0
+
+
+def test_results_of_another_command_are_kept(folder, engine, capsys):
+    assert torchdeform(["grid", "fixed.png", "--out", "out", "--quiet"]) == 0
+    assert "out has the results of another command" in _fails(capsys, 2, "fixed.png", "moving.png", "--out", "out")
+
+
+@pytest.mark.parametrize("suffix", ["png", "nii.gz"])
+def test_reports_are_full_light_or_none(folder, engine, suffix, capsys):
+    pair, drawn, sizes = [f"fixed.{suffix}", f"moving.{suffix}", "--out", "out"], {"overview.png", "report.html"}, {}
+    for report, more in (("full", drawn), ("light", drawn | {"thumb.jpg"}), ("none", set())):
+        assert main([*pair, "--report", report]) == 0
+        assert ("report.html" in capsys.readouterr().out) == (report != "none")
+        found = {path.name: path.stat().st_size for path in (folder / "out").iterdir()}
+        assert set(found) == {*RESULTS, f"warped.{suffix}"} - drawn | more
+        assert sorted(json.loads((folder / "out" / "result.json").read_text())["files"]) == sorted(found)
+        sizes[report] = found.get("report.html", 0)
+    assert sizes["light"] <= sizes["full"]
+    assert "report must be one of none, light, full" in _fails(capsys, 2, *pair, "--report", "some")
 
 
 def test_a_failure_keeps_the_earlier_results(folder, engine, capsys, monkeypatch):
@@ -246,7 +285,8 @@ def test_progress_is_shown_on_a_terminal_only(folder, engine, capsys, monkeypatc
     }.items():  # what rich takes for a terminal
         monkeypatch.setenv(name, value)
     assert main(["fixed.png", "moving.png"]) == 0
-    assert "level 2/2" in capsys.readouterr().err
+    shown = capsys.readouterr().err
+    assert all(stage in shown for stage in ("reading", "writing", "drawing"))
 
 
 def test_script_runs_without_installation(folder, root):

@@ -1,5 +1,6 @@
 """The verbs that apply, invert, compose and measure transforms: what they write, what they say, and how they fail."""
 
+import json
 import os
 from dataclasses import replace
 
@@ -11,13 +12,15 @@ import typer
 
 from torchdeform.cli import main as cli
 from torchdeform.cli import transforms
-from torchdeform.core.image import Image
-from torchdeform.core.transform import Affine, Transform
+from torchdeform.core.diagnostics import diagnose, inverse_error
+from torchdeform.core.image import Image, surroundings
+from torchdeform.core.transform import Affine, Displacement, Transform
 from torchdeform.core.warp import invert
 from torchdeform.io import read_displacement, read_image, write_displacement, write_image
 from torchdeform.io.images import read_labels
 from torchdeform.io.points import Points, read_points, write_points
 from torchdeform.io.transforms import read_transform, write_transform
+from torchdeform.report.record import describe_map
 
 DIMS = [2, 3]
 VERBS = {name: getattr(transforms, name) for name in ("apply", "points", "invert", "compose", "jacobian")}
@@ -79,7 +82,7 @@ def _resampled(moving, fixed, transform, how):
 
 @pytest.mark.parametrize(("name", "how"), [("linear", sitk.sitkLinear), ("cubic", sitk.sitkBSpline)])
 def test_apply_is_itk_s_resampling(folder, name, how):
-    options = ["--out", "out/warped.nii.gz", "--interpolation", name]
+    options = ["--out", "out/warped.nii.gz", "--interpolation", name, "--outside", "0"]
     assert run("apply", "transform.h5", "moving.nrrd", "--reference", "fixed.nrrd", *options) == 0
     ours = sitk.ReadImage("out/warped.nii.gz")
     np.testing.assert_allclose(
@@ -114,10 +117,14 @@ def test_apply_takes_the_grid_of_the_transform(folder):
     np.testing.assert_allclose(*(sitk.GetArrayFromImage(sitk.ReadImage(f"{n}.nrrd")) for n in "ab"), atol=1e-3)
     assert run("apply", "transform.h5", "moving.nrrd", "--out", "c.nrrd", "--outside", "-5") == 0
     assert read_image("c.nrrd").data.min() == -5
+    beyond = read_image("c.nrrd").data == -5
+    surrounded = read_image("a.nrrd").data[beyond].unique()
+    assert surrounded.tolist() == surroundings(read_image("moving.nrrd")).tolist() != [0.0]
+    assert run("apply", "transform.h5", "moving.nrrd", "--out", "d.nrrd", "--outside", "black") == 2
 
 
 def test_apply_the_other_way(folder):
-    options = ["--reference", "moving.nrrd", "--inverse", "--out", "back.nrrd"]
+    options = ["--reference", "moving.nrrd", "--inverse", "--outside", "0", "--out", "back.nrrd"]
     assert run("apply", "transform.h5", "fixed.nrrd", *options) == 0
     assert run("invert", "transform.h5", "--out", "inverse.h5", "--quiet") == 0
     expected = _resampled("fixed.nrrd", "moving.nrrd", "inverse.h5", sitk.sitkLinear)
@@ -149,7 +156,9 @@ def test_points_in_voxels(folder):
 
 def test_invert_inverts(folder, capsys):
     assert run("invert", "transform.h5", "--out", "inverse.h5") == 0
-    assert capsys.readouterr().out.startswith("inverse consistency")
+    out = capsys.readouterr().out
+    assert out.startswith("inverse consistency")
+    assert out.endswith("written              inverse.h5\n")
     there, back = (sitk.ReadTransform(f"{name}.h5") for name in ("transform", "inverse"))
     for p in read_points("points.csv").positions.tolist():
         np.testing.assert_allclose(back.TransformPoint(there.TransformPoint(p)), p, atol=0.1)
@@ -185,18 +194,21 @@ def test_jacobian(folder, capsys):
     det = chain.jacobian_determinant().data
     torch.testing.assert_close(read_image("det.nii.gz").data.double(), det, atol=1e-5, rtol=0)
     assert f"{float(det.max()):.3g}" in out
-    assert "folds        0" in out
+    assert "folds                0" in out
+    assert "written              det.nii.gz" in out
     assert run("jacobian", "affine.mat", "--reference", "moving.nrrd", "--out", "a.nrrd", "--quiet") == 0
     affine = read_image("a.nrrd").data
     torch.testing.assert_close(affine, torch.full_like(affine, 1.05**chain.dim))
 
 
-def test_a_picture_stays_one(tmp_path, monkeypatch, make_image, make_displacement):
+def test_a_picture_stays_one(tmp_path, monkeypatch, make_image, make_displacement, capsys):
     monkeypatch.chdir(tmp_path)
     picture = make_image((24, 30), channels=3, pixel_type="uint8")
     write_image(picture, "moving.png")
     write_transform(make_displacement(picture.grid, 0.1), picture, "t.h5")
     assert run("apply", "t.h5", "moving.png", "--out", "warped.png", "--interpolation", "cubic") == 0
+    assert run("apply", "t.h5", "moving.png", "--out", "w.png", "--outside", "-5") == 2
+    assert "moving.png is stored as uint8, which holds 0 to 255, so -5 does not fit" in capsys.readouterr().err
     warped = read_image("warped.png")
     assert (warped.pixel_type, tuple(warped.data.shape)) == ("uint8", (1, 3, 24, 30))
 
@@ -288,3 +300,50 @@ def test_help_says_which_way_points_and_images_go(verb, capsys, monkeypatch):
     text = " ".join(capsys.readouterr().out.split())
     for words in DIRECTIONS[verb]:
         assert words in text, text
+
+
+def test_what_is_printed_is_what_register_reports(folder, capsys):
+    """Folds, determinant and inverse consistency are those of the deformation, in voxels, whichever verb is asked."""
+    chain = read_transform("transform.h5")
+    u, grid = chain.stages[0].field.data, chain.stages[0].field.grid
+    back = invert(u, grid)
+    write_transform(replace(chain, stages=(Displacement(chain.stages[0].field), *chain.stages[1:])), "plain.h5")
+    known, (mean, largest) = diagnose(u, grid), inverse_error(u, back, grid)
+    assert run("jacobian", "transform.h5", "--out", "det.nii.gz", "--json") == 0
+    found = json.loads(capsys.readouterr().out)["deformations"]
+    assert found == [pytest.approx(describe_map(known))]
+    for name in ("transform.h5", "plain.h5"):
+        assert run("invert", name, "--out", "inverse.h5", "--json") == 0
+        record = json.loads(capsys.readouterr().out)
+        assert record["inverse_error_mean"] == pytest.approx(mean.item(), rel=1e-3)
+        assert record["inverse_error_max"] == pytest.approx(largest.item(), rel=1e-3)
+
+
+def test_folds_that_central_differences_miss_are_counted(tmp_path, monkeypatch, make_image, capsys):
+    monkeypatch.chdir(tmp_path)
+    image = make_image((20, 20))
+    u = torch.zeros(1, 2, 20, 20)
+    u[:, 0, 8:12:2] = 1.2  # every second row passes the next one
+    write_transform(u, image, "t.h5")
+    assert run("jacobian", "t.h5", "--out", "det.nii.gz", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["folds"] == int(diagnose(u, image.grid).folds) > 0
+
+
+def test_every_verb_says_what_it_wrote(folder, capsys):
+    for verb in (
+        ("apply", "transform.h5", "moving.nrrd"),
+        ("points", "transform.h5", "points.csv"),
+        ("compose", "u.nrrd", "affine.mat"),
+    ):
+        out = f"new/{verb[0]}{'.csv' if verb[0] == 'points' else '.nrrd'}"
+        assert run(*verb, "--out", out) == 0
+        assert capsys.readouterr() == (f"written  {out}\n", "")
+        assert run(*verb, "--out", out, "--quiet") == 0
+        assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["linear", "cubic", "label", "nearest"])
+def test_labels_are_not_mixed_in_silence(folder, capsys, name):
+    assert run("apply", "transform.h5", "labels.nrrd", "--out", "a.nrrd", "--interpolation", name) == 0
+    warned = capsys.readouterr().err
+    assert ("labels.nrrd looks like labels" in warned) == (name in ("linear", "cubic"))

@@ -1,6 +1,7 @@
 """Images in physical space: geometry, resampling, luminance, overlap."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from torchdeform.core.image import (
     overlap,
     require_registrable,
     resample,
+    surroundings,
 )
 from torchdeform.errors import InputError
 
@@ -117,6 +119,71 @@ def test_device_is_moved():
     image = Image(torch.zeros(1, 1, 4, 4), Grid((4, 4)), (1.0, 2.0), name="slice")
     moved = image.to("meta")
     assert (moved.data.device.type, moved.origin, moved.name) == ("meta", (1.0, 2.0), "slice")
+
+
+@pytest.mark.parametrize(("unit", "shown"), [("px", 2.5), ("mm", 2.5), ("µm", 2500.0)])
+def test_lengths_are_shown_in_the_unit_of_the_image(unit, shown):
+    image = Image(torch.zeros(1, 1, 4, 4), Grid((4, 4)), unit=unit)
+    assert image.in_unit(2.5) == shown
+    assert image.in_unit(torch.tensor([2.5])).item() == shown
+
+
+def test_unknown_units_are_refused():
+    with pytest.raises(InputError, match="slice: unit must be one of px, mm, µm, got 'inch'"):
+        Image(torch.zeros(1, 1, 4, 4), Grid((4, 4)), name="slice", unit="inch")
+
+
+def framed(border: tuple[float, ...], inside: tuple[float, ...], noise: float = 0.0, dim: int = 2) -> Image:
+    """Return an image of two colours: an object in the middle of a border."""
+    shape = (40, 50, 60)[-dim:]
+    middle = torch.zeros(shape, dtype=torch.bool)
+    middle[(slice(10, 30),) * dim] = True
+    data = torch.stack([torch.where(middle, i, b) for b, i in zip(border, inside, strict=True)])
+    data += noise * torch.randn(data.shape, generator=torch.manual_seed(0))
+    return Image(data[None], Grid(shape))
+
+
+@pytest.mark.parametrize(
+    ("border", "inside", "noise"),
+    [
+        ((0.0,), (200.0,), 0.0),
+        ((240.0,), (90.0,), 2.0),  # paper
+        ((-1000.0,), (40.0,), 20.0),  # air
+        ((240.0, 235.0, 230.0), (90.0, 40.0, 120.0), 2.0),
+        ((0.0, 0.0, 0.0, 0.0), (90.0, 40.0, 120.0, 255.0), 0.0),  # transparent
+    ],
+)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_what_surrounds_an_image_is_its_border(border, inside, noise, dim):
+    found = surroundings(framed(border, inside, noise, dim))
+    torch.testing.assert_close(found, torch.tensor(border), atol=noise, rtol=0)
+
+
+def test_an_image_full_of_tissue_is_surrounded_by_its_dark_end():
+    """Half of the border is tissue, and a corner holds what a scanner writes where it saw nothing."""
+    image = framed((-1000.0,), (40.0,), 20.0)
+    image.data[..., :25] = torch.linspace(-300, 300, 25)
+    image.data[..., :2, :2] = -3024.0
+    found = surroundings(image).item()
+    assert found == pytest.approx(-1000, abs=60)
+    assert found in image.data
+
+
+def test_what_is_not_finite_surrounds_nothing():
+    image = framed((7.0,), (1.0,))
+    image.data[..., 0, :] = math.nan
+    image.data[..., :, 0] = math.inf
+    assert surroundings(image).item() == 7
+    assert surroundings(replace(image, data=image.data * math.nan)).item() == 0
+
+
+def test_outside_of_colours_is_their_surroundings():
+    image = framed((240.0, 235.0, 230.0), (90.0, 40.0, 120.0))
+    far = replace(image, origin=(30.0, 0.0))
+    found = resample(image, far, outside="auto")
+    assert found[0, :, :, 25:].flatten(1).unique(dim=1).T.tolist() == [[240.0, 235.0, 230.0]]
+    with pytest.raises(InputError, match="outside, if it is no number, must be one of auto, got 'white'"):
+        resample(image, far, outside="white")
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from torch.autograd import gradcheck
 from torchdeform.core import grid as grids
 from torchdeform.core.derivatives import jacobian_determinant
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image, resample
+from torchdeform.core.image import Image, resample, surroundings
 from torchdeform.core.transform import Affine, Displacement, Transform
 from torchdeform.core.warp import invert
 from torchdeform.errors import InputError
@@ -124,6 +124,22 @@ def test_channels_and_the_value_outside(spaces, chain):
     assert (one == -1).any()
     torch.testing.assert_close(one[one != -1], -other[one != -1])
     assert (chain.image(moving, outside=None).data >= moving.data.min()).all()
+
+
+@pytest.mark.parametrize("mode", ["linear", "cubic", "nearest", "label"])
+def test_outside_is_what_surrounds_the_image_and_0_for_labels(spaces, chain, mode):
+    _, moving = spaces
+    both = replace(moving, data=torch.cat((moving.data.round() + 100, 50 - moving.data.round()), dim=1))
+    known, found = (
+        chain.image(both, mode=mode, outside=float("nan")).data,
+        chain.image(both, mode=mode, outside="auto").data,
+    )
+    beyond = known.isnan()
+    assert beyond.any()
+    assert torch.equal(found[~beyond], known[~beyond])
+    wanted = surroundings(both) if mode in ("linear", "cubic") else torch.zeros(2)
+    for channel in range(2):
+        assert found[:, channel][beyond[:, channel]].unique().tolist() == [wanted[channel].item()]
 
 
 @pytest.mark.parametrize("known", [False, True])

@@ -99,6 +99,17 @@ def test_one_slice_is_a_2d_image_of_its_spacing(tmp_path):
     assert image.grid.shape == SIZE[::-1]
     np.testing.assert_allclose(image.grid.spacing, SPACING[1::-1])
     assert read_image(tmp_path).grid == image.grid
+    assert image.unit == "mm"
+
+
+def test_pixels_of_a_slice_without_spacing_are_no_millimetres(tmp_path):
+    picture = sitk.GetImageFromArray(pixels(0)[None])
+    sitk.WriteImage(picture, str(tmp_path / "a.dcm"))
+    content = (tmp_path / "a.dcm").read_bytes()
+    for group, element in ((b"\x28\x00", b"\x30\x00"), (b"\x18\x00", b"\x10\x20")):  # ITK has two tags for it
+        content = content.replace(group + element, group + b"\x39\x20")
+    (tmp_path / "b.dcm").write_bytes(content)
+    assert [read_image(tmp_path / name).unit for name in ("a.dcm", "b.dcm")] == ["mm", "px"]
 
 
 def test_few_slices_are_2d_one_by_one_and_a_volume_together(tmp_path):

@@ -252,3 +252,35 @@ def test_black_and_white_is_an_image(folder, ending):
 def test_a_mask_that_is_not_there_is_an_error(folder, name):
     with pytest.raises(InputError, match="does not exist"):
         read_image(name)
+
+
+@pytest.mark.parametrize(
+    ("ending", "spacing", "unit"),
+    [
+        (".png", 1.0, "px"),
+        (".png", 0.5, "mm"),
+        (".jpg", 1.0, "px"),
+        (".bmp", 1.0, "px"),
+        (".tif", 1.0, "px"),
+        (".tif", 0.5, "mm"),
+        (".nii.gz", 1.0, "mm"),
+        (".mha", 1.0, "mm"),
+    ],
+)
+def test_files_without_a_spacing_count_in_pixels(tmp_path, ending, spacing, unit):
+    """ITK itself gives 1 mm to what has no spacing."""
+    image = Image(torch.zeros(1, 1, 12, 15), Grid((12, 15), (spacing, spacing)), pixel_type="uint8")
+    write_image(image, tmp_path / f"a{ending}")
+    assert read_image(tmp_path / f"a{ending}").unit == unit
+
+
+@pytest.mark.parametrize(("code", "unit", "size"), [(2, "mm", 1.0), (3, "µm", 1e-3), (1, "mm", 1e3), (0, "mm", 1.0)])
+def test_nifti_says_its_unit(tmp_path, make_image, code, unit, size):
+    """Metres, millimetres, micrometres or nothing: ITK gives millimetres."""
+    write_image(make_image((8, 9, 10)), tmp_path / "a.nii")
+    head = bytearray((tmp_path / "a.nii").read_bytes())
+    head[123] = code | 8  # xyzt_units, 8 is seconds
+    (tmp_path / "a.nii").write_bytes(head)
+    image = read_image(tmp_path / "a.nii")
+    assert image.unit == unit
+    assert image.grid.spacing == pytest.approx((size,) * 3)

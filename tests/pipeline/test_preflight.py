@@ -18,6 +18,7 @@ from torchdeform.pipeline.preflight import (
     WARNING,
     Report,
     flip_correlations,
+    looks_like_labels,
     preflight,
 )
 from torchdeform.registration.settings import RegistrationSettings
@@ -232,3 +233,41 @@ def test_real_images_turned_over_are_warned_of(data_folder, name):
     image = read_image(data_folder / name)
     turned = replace(image, data=image.data.flip(-1), name="turned")
     assert "turned looks mirrored along x" in texts(preflight(image, turned), WARNING)
+
+
+def pictures() -> dict[str, torch.Tensor]:
+    """Label images and images of grey values, each ``(40, 50)``."""
+    disc = (torch.cartesian_prod(torch.arange(40), torch.arange(50)) - 20).square().sum(1).view(40, 50)
+    noise = torch.rand(40, 50, generator=torch.manual_seed(0))
+    return {
+        "mask": (disc < 200).float(),
+        "regions": (disc < 300).float() * (1 + (disc < 100) + 998 * (disc < 30)),
+        "photograph": (noise * 255).round(),
+        "few grey values": (disc < 300) * (noise * 12).round(),
+        "not whole": (disc < 200) * 0.3,
+        "constant": torch.zeros(40, 50),
+    }
+
+
+@pytest.mark.parametrize("name", pictures())
+def test_labels_are_known_by_their_values(name):
+    image = Image(pictures()[name][None, None], Grid((40, 50)), name=f"{name}.nii.gz")
+    assert looks_like_labels(replace(image, name="a.nii.gz")) == (name in ("mask", "regions"))
+    colours = replace(image, data=image.data.expand(1, 3, -1, -1), name="a.png")
+    assert not looks_like_labels(colours)
+
+
+@pytest.mark.parametrize(
+    ("name", "labels"),
+    [
+        ("sub-01_seg.nii.gz", True),
+        ("brain_mask.mha", True),
+        ("Labels.png", True),
+        ("aparc+aseg.mgz", True),
+        ("masked.nii.gz", False),
+        ("segovia.png", False),
+    ],
+)
+def test_labels_are_known_by_their_names(name, labels):
+    image = Image(pictures()["photograph"][None, None] / 7, Grid((40, 50)), name=f"/seg/{name}")
+    assert looks_like_labels(image) == labels

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from nested_settings import changed, settings_of
-from pictures import bend, blobs
+from pictures import bend, blobs, disc
 
 from torchdeform.core.diagnostics import diagnose
 from torchdeform.core.grid import Grid
@@ -14,6 +14,7 @@ from torchdeform.core.image import Image, resample
 from torchdeform.core.warp import compose, max_voxels, warp
 from torchdeform.errors import InputError
 from torchdeform.registration.deformable import register
+from torchdeform.registration.settings import RegistrationSettings
 
 QUICK = settings_of(steps=(30, 30, 20), step_length=0.5, length_scale=6.0, window=7)
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -140,7 +141,22 @@ def test_images_are_taken_in_their_physical_place():
     fixed = replace(frame, data=resample(moving, frame, truth, outside=None).float())
     result = register(fixed, moving, changed(QUICK, align="none"))
     assert (result.displacement - truth).abs().mean() < 0.3 * truth.abs().mean()
-    torch.testing.assert_close(result.warped, resample(moving, fixed, result.displacement).float())
+    torch.testing.assert_close(result.warped, resample(moving, fixed, result.displacement, outside="auto").float())
+
+
+@pytest.mark.parametrize(("outside", "wanted"), [("auto", 200.0), (-7.5, -7.5)])
+def test_outside_of_the_moving_image_is_its_paper_or_the_number(outside, wanted):
+    data = 200 - 150 * disc((40, 44), (20.0, 24.0), 9.0)
+    fixed, moving = Image(data, Grid((40, 44))), Image(data[..., 6:], Grid((40, 38)), (6.0, 0.0))
+    result = register(fixed, moving, settings_of(steps=(2,), align="none", outside=outside))
+    assert torch.equal(result.warped[..., :5].unique(), torch.tensor([wanted]))
+    assert result.warped[..., 7:].min() < 60
+
+
+@pytest.mark.parametrize(("outside", "message"), [("white", "one of auto"), (math.nan, "outside must be finite")])
+def test_outside_is_a_number_or_auto(outside, message):
+    with pytest.raises(InputError, match=message):
+        RegistrationSettings(outside=outside)
 
 
 def test_colours_are_registered_and_warped_in_colour():

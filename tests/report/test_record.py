@@ -27,3 +27,13 @@ def test_record_is_plain_json(tmp_path, make_image, make_result):
     assert 0 < record["determinant_min"] < 1 < record["determinant_max"]
     assert len(record["levels"]) == 2
     assert set(record["versions"]) == {"torchdeform", "torch", "python"}
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("px", 1), ("mm", 1), ("µm", 1000)])
+def test_distances_are_in_the_unit_of_the_fixed_image(make_full, unit, factor):
+    _, record = make_full(2, unit=unit)
+    stage = record["evaluation"]["after"]
+    assert (record["unit"], record["moving"]["unit"]) == (unit, unit)
+    assert stage["landmark_error_mean"] == pytest.approx(1.5 * factor)
+    assert stage["hausdorff_95"]["1"] == pytest.approx(1.25 * factor)
+    assert record["moving"]["spacing"] == pytest.approx([1.1 * factor] * 2)

@@ -7,6 +7,7 @@ import pytest
 from torchdeform.report.verdict import BAD, DOUBTFUL, GOOD, judge, number
 
 FINE = {
+    "unit": "mm",
     "folds": 0,
     "similarity_before": 0.2,
     "similarity_after": 0.6,

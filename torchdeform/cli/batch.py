@@ -6,9 +6,10 @@ from typing import Annotated
 
 import typer
 
-from torchdeform.cli.options import Quiet, flag, table
+from torchdeform.cli.options import Quiet, flag, say_written, table
 from torchdeform.cli.progress import CohortProgress, stoppable
 from torchdeform.cohort.estimate import Costs, estimate
+from torchdeform.cohort.page import BADGES, VERDICTS
 from torchdeform.cohort.plan import DESCRIPTION, Plan, description, plan
 from torchdeform.cohort.run import review, run
 from torchdeform.cohort.schema import cohort_schema, read_cohort
@@ -80,6 +81,10 @@ def _run(work: Plan, whole: Plan, engine: EngineSettings, progress: CohortProgre
 def outcome(summary: Summary) -> str:
     """Return the outcome of a cohort in a few lines."""
     lines = {"pairs": f"{summary.done} done, {summary.failed} failed"}
+    judged = [f"{summary.badges[kind]} {BADGES[kind][1]}" for kind in VERDICTS if summary.badges.get(kind)]
+    if judged:
+        lines["verdict"] = ", ".join(judged)
+    lines |= {f"{title}, mean": text for title, text in summary.means.items()}
     if summary.failed:
         lines["failures"] = str(summary.out / FAILURES)
     return table(lines | {"results": str(summary.out / PAGE)})
@@ -93,6 +98,7 @@ def schema(out: SchemaOut = None) -> None:
         return
     with atomic_folder(out.parent) as folder:
         (folder / out.name).write_text(text, encoding="utf-8")
+    say_written(out)
 
 
 def overview(work: Plan, costs: Costs) -> str:

@@ -85,8 +85,8 @@ def _properties(image: Image) -> dict[str, str]:
     return {
         "file": image.name,
         "size": " × ".join(map(str, image.grid.shape[::-1])),
-        "spacing (mm)": " × ".join(f"{h:.4g}" for h in image.grid.spacing[::-1]),
-        "origin (mm)": ", ".join(f"{x:.5g}" for x in image.origin),
+        "spacing": " × ".join(f"{image.in_unit(h):.4g}" for h in image.grid.spacing[::-1]) + f" {image.unit}",
+        "origin": ", ".join(f"{image.in_unit(x):.5g}" for x in image.origin) + f" {image.unit}",
         "orientation": orientation(image) + (" (oblique)" if is_oblique(image) else ""),
         "intensities": f"{low:.5g} to {high:.5g}, {image.pixel_type}",
         "channels": str(image.data.shape[1]),

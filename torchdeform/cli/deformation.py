@@ -26,7 +26,11 @@ FMin = Annotated[float, typer.Option("--f-min", metavar="F", help="Size of the s
 FMax = Annotated[float, typer.Option("--f-max", metavar="F", help="Size of the largest cells.")]
 Smoothing = Annotated[
     float | None,
-    typer.Option(metavar="MM", show_default="2 voxels; simulate: 1", help="Standard deviation of the smoothing."),
+    typer.Option(
+        metavar="MM",
+        show_default="2 voxels; simulate: 1",
+        help="Standard deviation of the smoothing, in pixels where there is no spacing.",
+    ),
 ]
 Velocity = Annotated[str, choice(get_args(VelocityName), "{}.")]
 DisplacementFile = Annotated[
@@ -131,4 +135,6 @@ def _print(folder: Path, record: Record, lines: dict[str, str], *, json: bool, q
         print_json({**record, "out": str(folder)})
     if json or quiet:
         return
-    typer.echo(table({**lines, "folds": folds_text(record), "results": f"{folder}{os.sep}"}))
+    typer.echo(
+        table({**lines, "folds": folds_text(record), "results": f"{folder}{os.sep} ({', '.join(record['files'])})"})
+    )

@@ -50,14 +50,32 @@ Version = Annotated[
 ]
 
 
+def warn(sentence: str) -> None:
+    """Print a warning on stderr, because standard output has the figures only."""
+    typer.echo(f"warning: {sentence}", err=True)
+
+
 def print_json(record: Mapping[str, object]) -> None:
     """Print a record as JSON, the only line on standard output."""
     typer.echo(as_json(record))
 
 
 def folds_text(record: Mapping[str, Any]) -> str:
-    """Return the folds of a map and the range of its determinant, from its record."""
-    return f"{record['folds']}, determinant {record['determinant_min']:.3g} to {record['determinant_max']:.3g}"
+    """Return the folds of a map and the range of its determinant, from its record, and of which map they are."""
+    aligned = record.get("alignment", {}).get("kind", "none") != "none"
+    part = " without the alignment" if aligned else ""
+    return f"{record['folds']}, determinant {record['determinant_min']:.3g} to {record['determinant_max']:.3g}{part}"
+
+
+def inverse_text(mean: float, largest: float) -> str:
+    """Return how far a point is from its start after a map and its inverse, in voxels."""
+    return f"{mean:.2g} voxel on average, {largest:.2g} at most"
+
+
+def say_written(path: Path, lines: Mapping[str, str] | None = None, *, quiet: bool = False) -> None:
+    """Print some lines and the file that was written, unless nothing is to be printed."""
+    if not quiet:
+        typer.echo(table({**(lines or {}), "written": str(path)}))
 
 
 def table(lines: dict[str, str]) -> str:

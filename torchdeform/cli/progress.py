@@ -1,8 +1,8 @@
-"""Progress of a registration or a cohort: a bar on a terminal, plain lines elsewhere; and how a run is stopped."""
+"""Progress of a registration or a cohort: a bar on a terminal, a cohort's lines elsewhere; and how a run is stopped."""
 
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from typing import Self
 
@@ -13,9 +13,14 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeE
 
 from torchdeform.cohort.run import BEGIN, END, SKIPPED, Event
 from torchdeform.cohort.task import FAILED
+from torchdeform.core.stages import heard_by
 from torchdeform.registration.result import Progress as Step
 
 _STOPPED = 130  # exit code of a command that Ctrl-C ended, as shells have it
+
+# Where on the bar a stage of a registration begins; the levels lie between two of them.
+_STAGES = {"reading": 0.0, "aligning": 0.05, "searching": 0.2, "inverting": 0.85, "writing": 0.9, "drawing": 0.93}
+_LEVELS = (0.25, 0.85)
 
 
 @contextmanager
@@ -36,7 +41,7 @@ def stoppable(verb: str) -> Iterator[None]:
 
 
 class _Bar:
-    """A progress bar on stderr while a block runs, on a terminal only."""
+    """A progress bar on stderr while a block runs, on a terminal only. It redraws itself, so that its clock runs."""
 
     def __init__(self, quiet: bool, title: str, detail: str, total: float | None, *columns: ProgressColumn) -> None:
         console = Console(stderr=True, highlight=False)
@@ -54,7 +59,7 @@ class _Bar:
 
 
 class StepProgress(_Bar):
-    """Shows the steps of one registration.
+    """Shows the stages and steps of one registration.
 
     Args:
         quiet: show nothing.
@@ -62,10 +67,24 @@ class StepProgress(_Bar):
 
     def __init__(self, quiet: bool = False) -> None:
         super().__init__(quiet, "reading", "", 1.0, TimeElapsedColumn())
+        self._open = ExitStack()
+
+    def __enter__(self) -> Self:
+        self._open.enter_context(heard_by(self.begin))
+        return super().__enter__()
+
+    def __exit__(self, *how: object) -> None:
+        super().__exit__(*how)
+        self._open.close()
+
+    def begin(self, stage: str) -> None:
+        """Show the name of a stage, and how much of the work lies before it."""
+        self._progress.update(self._task, completed=_STAGES.get(stage), description=stage, detail="", refresh=True)
 
     def show(self, step: Step) -> None:
         """Show one step of the optimisation. Every level is the same share of the bar."""
-        done = (step.level + step.step / max(step.steps, 1)) / step.levels
+        start, end = _LEVELS
+        done = start + (end - start) * (step.level + step.step / max(step.steps, 1)) / step.levels
         title = f"level {step.level + 1}/{step.levels} {'×'.join(map(str, step.shape))}"
         detail = f"step {step.step}, similarity {step.similarity.mean().item():.4g}"
         self._progress.update(self._task, completed=done, description=title, detail=detail)

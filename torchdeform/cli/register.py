@@ -17,18 +17,22 @@ from torchdeform.cli.options import (
     choice,
     flag,
     folds_text,
+    inverse_text,
     optional_file,
     print_json,
     table,
+    warn,
 )
 from torchdeform.cli.progress import StepProgress
 from torchdeform.io.files import stem
 from torchdeform.metrics.similarity import measure_name
 from torchdeform.pipeline.config import load_settings, parse_override, preset_names
 from torchdeform.pipeline.memory import parse_size
-from torchdeform.pipeline.register import REPORT, Outcome, PairFiles, register_files
+from torchdeform.pipeline.register import REPORT, REPORTS, Outcome, PairFiles, register_files
 from torchdeform.registration.affine.settings import ALIGNMENTS
 
+Report = Annotated[str, choice(REPORTS, "Pictures: {}; light has the middle slices only.", "KIND")]
+Overwrite = Annotated[bool, flag("--overwrite", "Replace results of another pair in the folder.")]
 Fixed = Annotated[
     Path,
     typer.Argument(metavar="FIXED", help="Image that stays: PNG, TIFF, NIfTI, NRRD, a DICOM folder ..."),
@@ -73,6 +77,8 @@ def register(
     assignments: Assignments = None,
     memory: Memory = None,
     device: Device = "auto",
+    report: Report = "full",
+    overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
     version: Version = False,
@@ -100,12 +106,14 @@ def register(
     )
     limit = None if memory is None else parse_size(memory)
     with StepProgress(quiet) as bar:
-        outcome = register_files(files, settings, device=device, memory=limit, callback=bar.show)
+        outcome = register_files(
+            files, settings, device=device, memory=limit, report=report, overwrite=overwrite, callback=bar.show
+        )
     if json:
         print_json({**outcome.record, "out": str(outcome.folder)})
     elif not quiet:
-        for warning in outcome.record["warnings"]:  # on stderr: standard output has the figures only
-            typer.echo(f"warning: {warning}", err=True)
+        for warning in outcome.record["warnings"]:
+            warn(warning)
         typer.echo(summary(outcome))
 
 
@@ -115,20 +123,21 @@ def summary(outcome: Outcome) -> str:
     lines = {
         f"similarity ({measure_name(r['similarity'])})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
         "folds": folds_text(r),
-        "inverse consistency": f"{r['inverse_error_mean']:.2g} voxel on average, {r['inverse_error_max']:.2g} at most",
+        "inverse consistency": inverse_text(r["inverse_error_mean"], r["inverse_error_max"]),
         **_measured(r),
         "seconds": f"{sum(r['seconds'].values()):.1f} on {r['device']}",
         "results": f"{outcome.folder}{os.sep} ({', '.join(r['files'])})",
-        "look at": str(outcome.folder / REPORT),
     }
+    if REPORT in r["files"]:
+        lines["look at"] = str(outcome.folder / REPORT)
     return table(lines)
 
 
 def _measured(record: dict[str, Any]) -> dict[str, str]:
     """Return lines about labels and landmarks, if they were given."""
     lines = {}
-    for key, name in (("dice_mean", "Dice"), ("landmark_error_mean", "landmark error")):
+    for key, name, unit in (("dice_mean", "Dice", ""), ("landmark_error_mean", "landmark error", f" {record['unit']}")):
         figures = [f"{stage[key]:.4g}" for stage in record["evaluation"].values() if key in stage]
         if figures:
-            lines[name] = " -> ".join(figures)
+            lines[name] = " -> ".join(figures) + unit
     return lines

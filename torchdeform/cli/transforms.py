@@ -1,6 +1,5 @@
 """``apply``, ``points``, ``invert``, ``compose``, ``jacobian``: work with transforms."""
 
-import math
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
@@ -9,15 +8,37 @@ from typing import Annotated
 import torch
 import typer
 
-from torchdeform.cli.options import Json, Quiet, choice, flag, optional_file, print_json
-from torchdeform.core.image import Image
-from torchdeform.core.interpolation import COPYING, MODES
-from torchdeform.core.transform import Transform
+from torchdeform.cli.options import (
+    Json,
+    Quiet,
+    choice,
+    flag,
+    inverse_text,
+    optional_file,
+    print_json,
+    say_written,
+    warn,
+)
+from torchdeform.core.diagnostics import diagnose, inverse_error
+from torchdeform.core.image import AUTO, Image, same_place
+from torchdeform.core.interpolation import COPYING, LABEL_MODE, MODES
+from torchdeform.core.transform import Displacement, Transform
+from torchdeform.core.warp import voxels
 from torchdeform.errors import InputError, require_choice
 from torchdeform.io.files import require_writable, suffix
-from torchdeform.io.images import FORMATS, read_image, read_labels, read_optional, write_image, write_labels
+from torchdeform.io.images import (
+    FORMATS,
+    read_image,
+    read_labels,
+    read_optional,
+    require_storable,
+    write_image,
+    write_labels,
+)
 from torchdeform.io.points import read_points, require_points_file, write_points
 from torchdeform.io.transforms import read_transform, require_transform_file, write_transform
+from torchdeform.pipeline.preflight import looks_like_labels
+from torchdeform.report.record import describe_map
 
 TransformFile = Annotated[
     Path,
@@ -53,7 +74,9 @@ FieldGrid = Annotated[
 ]
 Interpolation = Annotated[str, choice(MODES, "{}; label or nearest keep values and their type.")]
 Inverse = Annotated[bool, flag("--inverse", "Use the inverse of TRANSFORM.")]
-Outside = Annotated[float, typer.Option(metavar="VALUE", help="Value where MOVING does not reach.")]
+Outside = Annotated[
+    str, typer.Option(metavar="VALUE", help="Value where MOVING does not reach; auto: what surrounds it, 0 for labels.")
+]
 
 
 def apply(
@@ -63,7 +86,8 @@ def apply(
     reference: Reference = None,
     interpolation: Interpolation = "linear",
     inverse: Inverse = False,
-    outside: Outside = 0.0,
+    outside: Outside = AUTO,
+    quiet: Quiet = False,
 ) -> None:
     """Warp the MOVING image onto the grid of the fixed image: result(x) = MOVING(TRANSFORM(x)).
 
@@ -72,12 +96,16 @@ def apply(
     """
     require_choice(interpolation, MODES, "--interpolation")
     _require_image_output(out, transform, moving, reference)
-    labels = interpolation in COPYING
+    labels, beyond = interpolation in COPYING, _outside(outside)
     chain = _read(transform, inverse)
     place = _place(chain, reference, transform)
     image = read_labels(moving) if labels else read_image(moving)
-    result = chain.image(image, place, mode=interpolation, outside=outside)
+    if not labels and looks_like_labels(image):
+        warn(f"{moving} looks like labels, which {interpolation} interpolation mixes; use --interpolation {LABEL_MODE}")
+    require_storable(beyond, suffix(out), image, labels=labels)
+    result = chain.image(image, place, mode=interpolation, outside=beyond)
     (write_labels if labels else write_image)(result, out)
+    say_written(out, quiet=quiet)
 
 
 def points(
@@ -86,6 +114,7 @@ def points(
     out: OutFile,
     reference: Counted = None,
     inverse: Inverse = False,
+    quiet: Quiet = False,
 ) -> None:
     """Map POINTS of the fixed image to the moving image: result = TRANSFORM(point), in world LPS mm.
 
@@ -97,6 +126,7 @@ def points(
     chain = _read(transform, inverse)
     given = read_points(points, read_optional(reference), dim=chain.dim)
     write_points(replace(given, positions=chain.points(given.positions)), out)
+    say_written(out, quiet=quiet)
 
 
 def invert(
@@ -105,7 +135,7 @@ def invert(
     """Write the inverse of TRANSFORM, which maps points from moving to fixed and images from fixed to moving.
 
     Affine maps are inverted exactly, displacement fields on their own grid. Prints how far a point is from its start
-    after TRANSFORM and its inverse.
+    after a field and its inverse, in voxels, as register does.
     """
     require_transform_file(out)
     _require_output(out, transform, reference)
@@ -114,14 +144,14 @@ def invert(
     write_transform(inverse, out)
     if quiet and not json:
         return
-    mean, largest = (math.nan, math.nan) if chain.reference is None else _round_trip(chain, chain.reference)
+    mean, largest = _inverse_error(chain.inverse())
     if json:
-        print_json({"out": out, "inverse_error_mean_mm": mean, "inverse_error_max_mm": largest})
-    elif chain.reference is not None:
-        typer.echo(f"inverse consistency  {mean:.2g} mm on average, {largest:.2g} at most")
+        print_json({"out": out, "inverse_error_mean": mean, "inverse_error_max": largest})
+    else:
+        say_written(out, {"inverse consistency": inverse_text(mean, largest)})
 
 
-def compose(transforms: TransformFiles, out: OutFile, reference: FieldGrid = None) -> None:
+def compose(transforms: TransformFiles, out: OutFile, reference: FieldGrid = None, quiet: Quiet = False) -> None:
     """Write one transform for several: points go through FIRST, then SECOND, and so on; images the other way.
 
     The result maps points of the fixed space of FIRST to the moving space of the last, and images back. ANTs lists its
@@ -134,6 +164,7 @@ def compose(transforms: TransformFiles, out: OutFile, reference: FieldGrid = Non
             "compose needs at least two transforms; give them in the order in which points go through them"
         )
     write_transform(_on_grid(reduce(Transform.then, map(_read, transforms)), reference), out)
+    say_written(out, quiet=quiet)
 
 
 def jacobian(
@@ -141,22 +172,26 @@ def jacobian(
 ) -> None:
     """Write the Jacobian determinant of TRANSFORM on the grid of the fixed image: moving volume over fixed volume.
 
-    Points go from fixed to moving: above 1 a piece of the fixed image is larger in the moving image, below 1 smaller;
-    0 or less is a fold.
+    Points go from fixed to moving: above 1 a piece of the fixed image is larger in the moving image, below 1 smaller.
+    The determinant is that of the whole map, with the alignment; that of the deformation alone is printed, too, as
+    register does, and its folds by all one-sided determinants.
     """
     _require_image_output(out, transform, reference)
     chain = _read(transform)
     image = chain.jacobian_determinant(_place(chain, reference, transform))
     write_image(image, out)
     low, high, mean = (float(f(image.data)) for f in (torch.amin, torch.amax, torch.mean))
-    folds = int((~(image.data > 0)).sum())
+    parts = [describe_map(diagnose(field.data, field.grid)) for field in _fields(chain)]
+    folds = max(int((~(image.data > 0)).sum()), sum(part["folds"] for part in parts))
     if json:
-        print_json(
-            {"out": out, "determinant_min": low, "determinant_max": high, "determinant_mean": mean, "folds": folds}
-        )
-    elif not quiet:
-        typer.echo(f"determinant  {low:.3g} to {high:.3g}, {mean:.3g} on average")
-        typer.echo(f"folds        {folds}")
+        whole = {"determinant_min": low, "determinant_max": high, "determinant_mean": mean, "folds": folds}
+        print_json({"out": out, **whole, "deformations": parts})
+        return
+    lines = {"determinant": f"{low:.3g} to {high:.3g}, {mean:.3g} on average"}
+    if len(chain.stages) > 1:
+        ranges = (f"{part['determinant_min']:.3g} to {part['determinant_max']:.3g}" for part in parts)
+        lines["without affine maps"] = " and ".join(ranges)
+    say_written(out, lines | {"folds": f"{folds}"}, quiet=quiet)
 
 
 def _read(path: Path, inverse: bool = False) -> Transform:
@@ -168,6 +203,16 @@ def _place(chain: Transform, reference: Path | None, path: Path) -> Image | None
     if reference is None and chain.reference is None:
         raise InputError(f"{path} has no grid for the result; give --reference IMAGE")
     return read_optional(reference)
+
+
+def _outside(text: str) -> float | str:
+    """Return the number that a text holds, or ``auto``."""
+    if text == AUTO:
+        return text
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"--outside needs a number or auto, got {text!r}") from error
 
 
 def _on_grid(chain: Transform, reference: Path | None) -> Transform:
@@ -193,8 +238,24 @@ def _require_output(out: Path, *inputs: Path | None) -> None:
     require_writable(out.parent)
 
 
-def _round_trip(chain: Transform, place: Image) -> tuple[float, float]:
-    """Return mean and maximum of |φ⁻¹(φ(x)) − x| over the nodes, in mm."""
-    back = chain.then(chain.inverse()).flatten(place).field.data
-    distance = back.square().sum(dim=1).sqrt()
-    return float(distance.mean()), float(distance.max())
+def _fields(chain: Transform) -> list[Image]:
+    """Return the displacement fields of a transform."""
+    return [stage.field for stage in chain.stages if isinstance(stage, Displacement)]
+
+
+def _inverse_error(inverse: Transform) -> tuple[float, float]:
+    """Return mean and maximum of |φ(φ⁻¹(x)) − x| in voxels, for the worst field; affine maps have no error."""
+    found = [_field_error(stage) for stage in inverse.stages if isinstance(stage, Displacement)]
+    return max((mean for mean, _ in found), default=0.0), max((largest for _, largest in found), default=0.0)
+
+
+def _field_error(stage: Displacement) -> tuple[float, float]:
+    """Return mean and maximum of how far, in voxels, a field and its inverse take the nodes from their places."""
+    field, known = stage.field, stage.known_inverse
+    if known is None:
+        return 0.0, 0.0
+    if same_place(field, known):
+        mean, largest = inverse_error(known.data.to(field.data), field.data, field.grid)
+        return mean.item(), largest.item()
+    distance = voxels(Transform((stage, Displacement(known))).flatten(field).field.data, field.grid)
+    return distance.mean().item(), distance.max().item()

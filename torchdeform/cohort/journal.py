@@ -92,6 +92,7 @@ class Journal:
             "settings": asdict(job.settings),
             "device": job.device,
             "memory": job.memory,
+            "report": job.report,
             "voxels": job.voxels,
             "submission": None if job.submission is None else job.submission.name,
             "inputs": inputs,

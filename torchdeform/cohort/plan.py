@@ -31,6 +31,7 @@ class Job:
         settings: of the pair, complete.
         device: ``auto``, ``cpu`` or ``cuda``.
         memory: limit in bytes, None for all that is free.
+        report: ``none``, ``light`` or ``full``, see `register_files`.
         submission: file for the displacement as the Learn2Reg challenge reads it, None for none.
         voxels: whether landmarks are rows of voxel indices without titles, as in Learn2Reg.
     """
@@ -40,6 +41,7 @@ class Job:
     settings: RegistrationSettings
     device: str = "auto"
     memory: int | None = None
+    report: str = "light"
     submission: Path | None = None
     voxels: bool = False
 
@@ -193,6 +195,7 @@ def _job(pair: PairSpec, cohort: Cohort, settings: RegistrationSettings) -> Job:
         settings=settings,
         device=cohort.device,
         memory=cohort.memory,
+        report=cohort.report,
         submission=cohort.out / SUBMISSION / _submission(pair) if cohort.layout == "learn2reg" else None,
         voxels=pair.voxels and pair.files.keys() >= {*_POINTS},
     )
@@ -210,7 +213,8 @@ def register_job(job: Job, *, callback: Callback | None = None) -> Outcome:
         ComputationError: see `register_files`.
     """
     files = _with_titles(job.files) if job.voxels else job.files
-    outcome = register_files(files, job.settings, device=job.device, memory=job.memory, callback=callback)
+    how = {"device": job.device, "memory": job.memory, "report": job.report}
+    outcome = register_files(files, job.settings, **how, overwrite=True, callback=callback)  # the journal knows whose
     if job.submission is not None:
         displacement = read_displacement(outcome.folder / "displacement.nii.gz")
         fixed, moving = read_image(files.fixed), read_image(files.moving)

@@ -269,6 +269,8 @@ class Cohort(Strict):
     """Where a pair is registered."""
     memory: Size | None = None
     """Limit of memory of a pair, such as 4GB; a pair that needs more is registered on a coarser grid."""
+    report: Literal["none", "light", "full"] = "light"
+    """Pictures of a pair: full is a page with stacks of slices, light has the middle slices only."""
     engine: EngineSettings = Field(default_factory=EngineSettings)
     """Where the pairs run."""
     layout: Literal["derivatives", "learn2reg"] = "derivatives"

@@ -31,6 +31,7 @@ FIGURES = (
     "determinant_max",
     "inverse_error_mean",
     "inverse_error_max",
+    "unit",
 )
 # The names in the record of the figures that are measured before and after.
 _MEASURED = {"dice": "dice_mean", "landmark_error": "landmark_error_mean"}

@@ -15,7 +15,7 @@ from torchdeform.cohort.run import Event, run
 from torchdeform.cohort.schema import Cohort
 from torchdeform.cohort.summary import Failure
 from torchdeform.core.diagnostics import diagnose
-from torchdeform.core.image import Image
+from torchdeform.core.image import AUTO, Image
 from torchdeform.core.transform import Displacement, Transform
 from torchdeform.core.warp import compose
 from torchdeform.errors import ComputationError, InputError
@@ -232,7 +232,7 @@ def _publish_subject(subject: Subject, from_template: Transform, template: Templ
     """Write the map of an image and the image on the template; return its files, folds and determinants."""
     place = Path(SUBJECTS) / subject.name
     image, map_ = read_image(subject.image), from_template.to("cpu")
-    warped = replace(map_.image(image, template.image.to("cpu")), pixel_type=image.pixel_type)
+    warped = replace(map_.image(image, template.image.to("cpu"), outside=AUTO), pixel_type=image.pixel_type)
     with atomic_folder(out / place) as folder:
         write_transform(map_, folder / _TRANSFORM)
         write_transform(map_.inverse(), folder / _INVERSE)

@@ -3,19 +3,25 @@
 import math
 from dataclasses import dataclass, replace
 from itertools import permutations
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid, over_slabs
 from torchdeform.core.warp import inside_box, sample
-from torchdeform.errors import InputError
+from torchdeform.errors import InputError, require_choice
 
 # Alpha that means opaque, by pixel type; floating types count from 0 to 1.
 _OPAQUE = {"uint8": 255.0, "uint16": 65535.0}
 _RGBA = 4
 # Letters of the world axes x, y, z: what their positive and negative directions point to.
 _LETTERS = ("LR", "PA", "SI")
+
+# Units that lengths are shown in, and how long 1 of the world's coordinates is in them.
+UNITS = {"px": 1.0, "mm": 1.0, "µm": 1000.0}
+
+_Length = TypeVar("_Length", float, Tensor)
 
 
 @dataclass(frozen=True)
@@ -30,9 +36,11 @@ class Image:
             default.
         name: what to call it in messages, usually its path.
         pixel_type: numpy name of the type it is stored with, for writing results alike.
+        unit: what its lengths are shown in: ``px`` for files without a spacing, whose pixels are 1 apart, ``mm``, or
+            ``µm`` where the file has it. Coordinates are in mm with both of the latter.
 
     Raises:
-        InputError: the parts do not fit together.
+        InputError: the parts do not fit together, or an unknown unit.
     """
 
     data: Tensor
@@ -41,6 +49,7 @@ class Image:
     direction: tuple[tuple[float, ...], ...] = ()
     name: str = "image"
     pixel_type: str = "float32"
+    unit: str = "mm"
 
     def __post_init__(self) -> None:
         dim = self.grid.dim
@@ -50,6 +59,7 @@ class Image:
         object.__setattr__(self, "direction", tuple(tuple(map(float, r)) for r in self.direction) or identity)
         if len(self.origin) != dim or len(self.direction) != dim or {len(r) for r in self.direction} != {dim}:
             raise InputError(f"{self.name}: origin and direction must have {dim} axes like the image")
+        require_choice(self.unit, UNITS, f"{self.name}: unit")
         if not all(map(math.isfinite, self.origin)):
             raise InputError(f"{self.name}: its origin {self.origin} is not finite; correct the header of the file")
         if not abs(float(torch.linalg.det(torch.tensor(self.direction, dtype=torch.float64)))) > 1e-6:
@@ -68,6 +78,10 @@ class Image:
         """Return the same image with its pixels on ``device``."""
         return replace(self, data=self.data.to(device))
 
+    def in_unit(self, length: _Length) -> _Length:
+        """Return a length of the world, such as a spacing, in the image's `unit`."""
+        return length * UNITS[self.unit]
+
     def _rotation(self, like: Tensor) -> Tensor:
         return torch.tensor(self.direction, dtype=like.dtype, device=like.device)
 
@@ -76,8 +90,17 @@ class Image:
         return origin.view(1, -1, *([1] * (like.dim() - 2)))  # points may come as a list as well as on a grid
 
 
+# Outside of an image: a number, None for the nearest value inside, or this for what `surroundings` finds.
+AUTO = "auto"
+
+# What surrounds an image is the median of its faces if most of them, this share, are near it: closer than this share of
+# the range between its dark and bright ends, these quantiles. Fewer pixels may mark what a scanner cannot see.
+_MOSTLY, _NEAR, _ENDS = 0.5, 0.05, (0.05, 0.95)
+_SOME = 2**20  # pixels of which quantiles are taken
+
+
 def resample(
-    moving: Image, fixed: Image, u: Tensor | None = None, *, mode: str = "linear", outside: float | None = 0.0
+    moving: Image, fixed: Image, u: Tensor | None = None, *, mode: str = "linear", outside: float | str | None = 0.0
 ) -> Tensor:
     """Return moving(φ(x)) at the nodes x of ``fixed``, both taken in their physical place.
 
@@ -87,7 +110,8 @@ def resample(
         u: displacement ``(1, D, *S)`` on the fixed grid (array order, units of spacing) of φ = id + u; zero when
             None.
         mode: ``linear`` or ``nearest``.
-        outside: value outside the moving image (ITK's resampler uses 0); None continues its edge.
+        outside: value outside the moving image (ITK's resampler uses 0); None continues its edge, ``auto`` takes what
+            `surroundings` says.
 
     Returns:
         ``(1, C, *S)`` on the fixed grid; the moving pixels themselves where both images have one grid and one place.
@@ -98,13 +122,47 @@ def resample(
     if u is None and same_place(moving, fixed):
         return moving.data
     grid, device = fixed.grid, moving.data.device
+    beyond = outside_value(moving, outside)
 
     def values(rows: slice) -> Tensor:
         points = grid.points(dtype=torch.float64, device=device, rows=rows)
         points = points if u is None else points + u[:, :, rows]
-        return sample(moving.data, moving.to_grid(fixed.to_world(points)), moving.grid, mode=mode, outside=outside)
+        return sample(moving.data, moving.to_grid(fixed.to_world(points)), moving.grid, mode=mode, outside=beyond)
 
     return over_slabs(values, grid.shape, device)
+
+
+def outside_value(image: Image, outside: float | str | None) -> float | Tensor | None:
+    """Return the value outside of an image that a number, None or ``auto`` stands for.
+
+    Raises:
+        InputError: another word.
+    """
+    if not isinstance(outside, str):
+        return outside
+    require_choice(outside, (AUTO,), f"{image.name}: outside, if it is no number,")
+    return surroundings(image)
+
+
+def surroundings(image: Image) -> Tensor:
+    """Return what surrounds an image, such as air or paper, for each channel ``(C,)``.
+
+    Args:
+        image: pixels that are not finite do not count.
+
+    Notes:
+        The median of the image's faces if most of them are close to it in all channels, else its dark end, below which
+        are 5 % of the pixels. Either is a value that occurs in the image, so its type can hold it.
+    """
+    data, flat = image.data, image.data.flatten(2)
+    faces = torch.cat([data.select(axis, end).flatten(2) for axis in range(2, data.dim()) for end in (0, -1)], dim=2)
+    some = flat[..., :: 1 + flat.shape[2] // _SOME]
+    faces, some = (torch.where(part.isfinite(), part, torch.nan) for part in (faces, some))
+    low, high = some.nanquantile(torch.tensor(_ENDS).to(flat), dim=2, interpolation="lower")
+    middle = faces.nanmedian(dim=2).values
+    near = ((faces - middle.unsqueeze(2)).abs() <= _NEAR * (high - low).unsqueeze(2)).all(1)
+    found = middle if float(near[faces.isfinite().all(1)].double().mean()) > _MOSTLY else low
+    return found[0].nan_to_num(0.0, 0.0, 0.0)
 
 
 def same_place(a: Image, b: Image) -> bool:
@@ -185,8 +243,8 @@ def require_same_place(image: Image, other: Image, *, atol: float = 1e-3) -> Non
     apart = (image.to_world(ends) - other.to_world(ends)).norm(dim=1).max()
     if float(apart) > atol * min(other.grid.spacing):
         raise InputError(
-            f"{image.name} and {other.name} must lie in one place, but their headers put them {float(apart):.3g} mm "
-            "apart; correct origin, spacing or direction in one of them"
+            f"{image.name} and {other.name} must lie in one place, but their headers put them "
+            f"{image.in_unit(float(apart)):.3g} {image.unit} apart; correct origin, spacing or direction in one of them"
         )
 
 

@@ -8,10 +8,11 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import MAX_POOL
-from torchdeform.core.warp import inside_box, sample
+from torchdeform.core.warp import sample, with_outside
 from torchdeform.errors import InputError, require_choice
 
 Sampler = Callable[[Tensor], Tensor]
+Outside = float | Tensor | None  # for all channels, or one per channel (C,)
 _Support = list[tuple[Tensor, Tensor]]  # nodes and weights
 _Kernel = tuple[tuple[float, float, float, float], ...]
 
@@ -37,7 +38,7 @@ _RADIUS = 2
 _POINTS_AT_ONCE = 2**16
 
 
-def interpolator(image: Tensor, grid: Grid, *, mode: str = "linear", outside: float | None = 0.0) -> Sampler:
+def interpolator(image: Tensor, grid: Grid, *, mode: str = "linear", outside: Outside = 0.0) -> Sampler:
     """Return the function p ↦ image(p).
 
     Args:
@@ -67,11 +68,11 @@ def interpolator(image: Tensor, grid: Grid, *, mode: str = "linear", outside: fl
     return _MODES[mode](image, grid, outside)
 
 
-def _linear(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
+def _linear(image: Tensor, grid: Grid, outside: Outside) -> Sampler:
     return lambda points: sample(image, points, grid, outside=outside)
 
 
-def _nearest(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
+def _nearest(image: Tensor, grid: Grid, outside: Outside) -> Sampler:
     values = image.flatten(2)[0]
 
     def at(points: Tensor) -> Tensor:
@@ -79,12 +80,12 @@ def _nearest(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
         node = torch.zeros_like(index[0], dtype=torch.long)
         for x, n, stride in zip(index, grid.shape, grid.strides, strict=True):
             node += torch.floor(x.detach() + 0.5).nan_to_num().clamp(0, n - 1).long() * stride
-        return _fill(_take(values, node), points, grid, outside)
+        return with_outside(_take(values, node), points, grid, outside)
 
     return at
 
 
-def _label(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
+def _label(image: Tensor, grid: Grid, outside: Outside) -> Sampler:
     if not bool(image.isfinite().all()):
         raise InputError("labels must be finite numbers, but some are NaN or infinite; replace them first, say by 0")
     nearest = _nearest(image, grid, None)
@@ -98,7 +99,7 @@ def _label(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
             for some in zip(*(part.split(_POINTS_AT_ONCE) for part in there), strict=True):
                 near = [x[some].clamp(0, n - 1) for x, n in zip(index, grid.shape, strict=True)]
                 found[:, channel][some] = _heaviest_label(*_weighted_labels(values, near, grid))
-        return _fill(found, points, grid, outside)
+        return with_outside(found, points, grid, outside)
 
     return at
 
@@ -142,7 +143,7 @@ def _heaviest_label(labels: Tensor, weights: Tensor) -> Tensor:
     return found
 
 
-def _cubic(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
+def _cubic(image: Tensor, grid: Grid, outside: Outside) -> Sampler:
     coefficients = spline_coefficients(image, grid).flatten(2)[0]
 
     def at(points: Tensor) -> Tensor:
@@ -152,7 +153,7 @@ def _cubic(image: Tensor, grid: Grid, outside: float | None) -> Sampler:
         along = zip(index, grid.shape, grid.strides, strict=True)
         supports = [_support(x, n, stride, image.dtype, _SPLINE) for x, n, stride in along]
         start = torch.zeros_like(index[0], dtype=torch.long)
-        return _fill(_weighted_sum(coefficients, supports, start), points, grid, outside)
+        return with_outside(_weighted_sum(coefficients, supports, start), points, grid, outside)
 
     return at
 
@@ -165,7 +166,7 @@ def _weighted_sum(values: Tensor, supports: list[_Support], start: Tensor) -> Te
     return sum(terms[1:], start=terms[0])
 
 
-_MODES: dict[str, Callable[[Tensor, Grid, float | None], Sampler]] = {
+_MODES: dict[str, Callable[[Tensor, Grid, Outside], Sampler]] = {
     "nearest": _nearest,
     "linear": _linear,
     "cubic": _cubic,
@@ -211,8 +212,3 @@ def _support(index: Tensor, count: int, stride: int, dtype: torch.dtype, kernel:
 def _take(values: Tensor, nodes: Tensor) -> Tensor:
     """Return values ``(C, N)`` at positions ``(B, *T)`` of the flattened grid as ``(B, C, *T)``."""
     return values.index_select(1, nodes.flatten()).view(-1, *nodes.shape).movedim(0, 1)
-
-
-def _fill(values: Tensor, points: Tensor, grid: Grid, outside: float | None) -> Tensor:
-    """Put ``outside`` where the nearest node, were the grid continued, is not of the grid."""
-    return values if outside is None else torch.where(inside_box(points, grid), values, outside)

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from torchdeform.core.derivatives import jacobian_determinant
 from torchdeform.core.grid import over_slabs
-from torchdeform.core.image import Image, overlap
-from torchdeform.core.interpolation import LABEL_MODE, interpolator
+from torchdeform.core.image import AUTO, Image, outside_value, overlap
+from torchdeform.core.interpolation import COPYING, LABEL_MODE, interpolator
 from torchdeform.core.warp import invert, sample
 from torchdeform.errors import InputError
 
@@ -280,7 +280,7 @@ class Transform:
         return columns[0].T if rows else columns
 
     def image(
-        self, moving: Image, reference: Image | None = None, *, mode: str = "linear", outside: float | None = 0.0
+        self, moving: Image, reference: Image | None = None, *, mode: str = "linear", outside: float | str | None = 0.0
     ) -> Image:
         """Return warped(x) = moving(φ(x)): the moving image comes to the fixed space.
 
@@ -289,6 +289,8 @@ class Transform:
             reference: grid of the result; `reference` of this transform when None.
             mode: ``nearest``, ``linear``, ``cubic`` or ``label``; see `torchdeform.core.interpolation.interpolator`.
             outside: value where φ(x) is outside the moving image (ITK's resampler uses 0); None continues its edge.
+                ``auto``: what `torchdeform.core.image.surroundings` finds, such as air or paper; 0 in the modes that
+                copy labels.
 
         Returns:
             An image on the reference grid, with the moving image's type.
@@ -302,7 +304,8 @@ class Transform:
         """
         place = self._reference(reference)
         self._check(moving, self.moving, "moving")
-        at = interpolator(moving.data, moving.grid, mode=mode, outside=outside)
+        beyond = 0.0 if outside == AUTO and mode in COPYING else outside_value(moving, outside)
+        at = interpolator(moving.data, moving.grid, mode=mode, outside=beyond)
         pixels = _over_nodes(place, lambda nodes: at(moving.to_grid(self.points(nodes))), moving.data.device)
         return replace(place, data=pixels, name=moving.name, pixel_type=moving.pixel_type)
 

@@ -39,7 +39,9 @@ _NODES_AT_ONCE = 2**20
 _RESTARTS = 8
 
 
-def sample(image: Tensor, points: Tensor, grid: Grid, *, mode: str = "linear", outside: float | None = None) -> Tensor:
+def sample(
+    image: Tensor, points: Tensor, grid: Grid, *, mode: str = "linear", outside: float | Tensor | None = None
+) -> Tensor:
     """Return image(p) at points p.
 
     Args:
@@ -48,7 +50,8 @@ def sample(image: Tensor, points: Tensor, grid: Grid, *, mode: str = "linear", o
             shape.
         grid: the grid of the image.
         mode: ``linear`` (multilinear) or ``nearest``.
-        outside: value given to points more than half a voxel outside Ω; None clamps points to Ω.
+        outside: value given to points more than half a voxel outside Ω, a number or one per channel ``(C,)``;
+            None clamps points to Ω.
 
     Returns:
         ``(B, C, *T)``.
@@ -64,7 +67,16 @@ def sample(image: Tensor, points: Tensor, grid: Grid, *, mode: str = "linear", o
         given = f"{tuple(points.shape)} of {points.dtype}"
         raise InputError(f"sample: points must be floating-point of shape (B, {grid.dim}, *T), got {given}")
     values = _sample(image, _normalise([-1.0] * grid.dim, points, grid), mode)
-    return values if outside is None else torch.where(inside_box(points, grid), values, outside)
+    return with_outside(values, points, grid, outside)
+
+
+def with_outside(values: Tensor, points: Tensor, grid: Grid, outside: float | Tensor | None) -> Tensor:
+    """Return values ``(B, C, *T)`` with ``outside`` where the nearest node, were the grid continued, is not of it."""
+    if outside is None:
+        return values
+    if isinstance(outside, Tensor):
+        outside = outside.to(values).view(-1, *[1] * (values.dim() - 2))
+    return torch.where(inside_box(points, grid), values, outside)
 
 
 def warp(image: Tensor, u: Tensor, grid: Grid, *, mode: str = "linear", outside: float | None = None) -> Tensor:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +28,7 @@ _SHEAR = 0.01  # share of a step by which neighbouring slices may be shifted sid
 _SAME = 1e-2  # mm; slices closer than this are at the same position
 
 _POSITION, _SERIES, _TITLE, _FRAME_TIME = "0020|0032", "0020|000e", "0008|103e", ("0018|1063", "0018|1065")
+_SPACINGS = ("0028|0030", "0018|1164", "0018|2010")  # of pixels; without any they are 1 apart
 _MOMENT = ("0018|1060", "0008|0032")  # trigger time, acquisition time
 _PARTS = ("0018|0086", "0020|0100")  # echo and time index, which distinguish volumes of one series
 
@@ -93,7 +94,10 @@ def read_file(path: Path) -> Image:
     if here.cine:
         raise InputError(f"{path} is a cine of {here.size[2]} frames; export one frame and give that")
     if here.size[2] > 1 or _has_frames(series := _like(here)) or len(series) < VOLUME_SLICES:
-        return itk.to_image(_load(path), str(path))
+        loaded = _load(path)
+        image = itk.to_image(loaded, str(path))
+        known = set(image.grid.spacing) != {1.0} or any(map(loaded.HasMetaDataKey, _SPACINGS))
+        return image if known else replace(image, unit="px")
     return _volume(series, str(path))
 
 

@@ -7,6 +7,7 @@ import tempfile
 import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -50,6 +51,9 @@ FORMATS: dict[str, Format] = {
 
 # Pictures that ITK may refuse (for instance grey with alpha) but scikit-image reads. They have spacing 1 in ITK too.
 _PLAIN_PICTURES = (".png", ".gif", ".webp")
+
+# Files that have no spacing if ITK says 1.
+_PICTURES = (*_PLAIN_PICTURES, ".jpg", ".jpeg", ".bmp")
 
 # What the readers of ITK say about a file that is cut off, each in its own words.
 _DAMAGE_SIGNS = ("fread got only", "inflate", "Cannot read requested file", "unexpected end")
@@ -116,9 +120,10 @@ def _read_gzip(path: Path) -> Image:
 
 def _read_by_itk(path: Path) -> Image:
     try:
-        return itk.to_image(itk.load(path), str(path))
+        image = itk.to_image(itk.load(path), str(path))
     except RuntimeError as error:
         return _read_otherwise(path, itk.reason(error))
+    return replace(image, unit="px") if suffix(path) in _PICTURES and set(image.grid.spacing) == {1.0} else image
 
 
 def _read_otherwise(path: Path, reason: str) -> Image:
@@ -152,7 +157,7 @@ def _picture(values: NDArray[np.generic], name: str) -> Image:
     if pixels.shape[-1] == 2:
         pixels = pixels[..., [0, 0, 0, 1]]
     data = torch.from_numpy(np.moveaxis(pixels, -1, 0).astype(np.float32)).unsqueeze(0)
-    return Image(data, Grid(pixels.shape[:2]), name=name, pixel_type=values.dtype.name)
+    return Image(data, Grid(pixels.shape[:2]), name=name, pixel_type=values.dtype.name, unit="px")
 
 
 def write_image(image: Image, path: str | os.PathLike[str]) -> None:
@@ -173,7 +178,7 @@ def write_image(image: Image, path: str | os.PathLike[str]) -> None:
     pixels, paged = _stored(image, file), suffix(file) in (".tif", ".tiff") and image.grid.dim == 3
     if paged and pixels.dtype.name in _PAGED:
         with atomic_folder(file.parent) as folder:
-            write_tiff(pixels, image.grid.spacing, folder / file.name)
+            write_tiff(pixels, list(map(image.in_unit, image.grid.spacing)), image.unit, folder / file.name)
     else:
         itk.save(itk.from_values(pixels, image), file)
 
@@ -186,13 +191,30 @@ def _stored(image: Image, path: Path) -> NDArray[np.generic]:
     if not can_hold(ending, image):
         what = f"{image.grid.dim}D {image.pixel_type} images of {image.data.shape[1]} channels"
         raise InputError(f"{path}: {ending} files cannot hold {what}; use .tif or .nii.gz")
-    types = FORMATS[ending].types
-    kind = np.dtype(image.pixel_type if image.pixel_type in types else types[-1])
-    values = image.data[0].detach().cpu().numpy()
+    kind, values = _stored_type(ending, image), image.data[0].detach().cpu().numpy()
     if kind.kind == "f":
         return values.astype(kind)
     limits = np.iinfo(kind)
     return np.rint(values).clip(limits.min, limits.max).astype(kind)
+
+
+def _stored_type(ending: str, image: Image) -> np.dtype[Any]:
+    """Return the type in which files of this ending store the image."""
+    types = FORMATS[ending].types
+    return np.dtype(image.pixel_type if image.pixel_type in types else types[-1])
+
+
+def require_storable(value: float | str, ending: str, image: Image, *, labels: bool = False) -> None:
+    """Raise `InputError` unless a value outside of the image fits into files of this ending; words always do."""
+    kind: np.dtype[Any] = np.dtype(image.pixel_type) if labels else _stored_type(ending, image)
+    if isinstance(value, str) or kind.kind == "f":
+        return
+    limits = np.iinfo(kind)
+    if not limits.min <= value <= limits.max:
+        raise InputError(
+            f"outside: {image.name} is stored as {kind}, which holds {limits.min} to {limits.max}, so {value:g} does "
+            "not fit; choose another value, or auto"
+        )
 
 
 def can_hold(ending: str, image: Image) -> bool:

@@ -25,6 +25,9 @@ _DAMAGE_SIGNS = ("TIFFReadDirectory", "TIFFFetchDirectory", "TIFFFillStrip", "no
 # How much the columns of a direction matrix may deviate from unit length and right angles.
 _SQUARE = 1e-3
 
+# NIfTI's units of space are the last three bits of this number. ITK gives mm whatever they are.
+_NIFTI_UNITS, _SPACE_BITS, _MICROMETRES = "xyzt_units", 7, 3
+
 _Result = TypeVar("_Result")
 
 
@@ -138,7 +141,13 @@ def to_image(itk: "sitk.Image", name: str) -> Image:
     data = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32).reshape(1, *shape, channels))
     grid = Grid(shape, tuple(reversed(spacing)))
     rows = tuple(tuple(map(float, row)) for row in direction)
-    return Image(data.movedim(-1, 1).contiguous(), grid, tuple(origin), rows, name, values.dtype.name)
+    return Image(data.movedim(-1, 1).contiguous(), grid, tuple(origin), rows, name, values.dtype.name, _unit(itk))
+
+
+def _unit(itk: "sitk.Image") -> str:
+    """Return the unit to show lengths in: µm for NIfTI files that say so."""
+    code = itk.GetMetaData(_NIFTI_UNITS) if itk.HasMetaDataKey(_NIFTI_UNITS) else ""
+    return "µm" if code.isdigit() and int(code) & _SPACE_BITS == _MICROMETRES else "mm"
 
 
 def _require_square(itk: "sitk.Image", name: str) -> None:

@@ -5,6 +5,7 @@ import math
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
@@ -22,13 +23,15 @@ from torchdeform.io.validation import DAMAGED
 if TYPE_CHECKING:
     from tifffile import TiffFile
 
-# Length of a unit in millimetres, by the names that ImageJ and OME write.
+# Length of a unit in millimetres, by the names that ImageJ and OME write. Shorter ones than 0.1 mm are shown in µm.
 _MILLIMETRES = {
     "nm": 1e-6, "nanometer": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "\\u00b5m": 1e-3, "micron": 1e-3,
     "microns": 1e-3, "micrometer": 1e-3, "mm": 1.0, "millimeter": 1.0, "cm": 10.0, "centimeter": 10.0, "m": 1e3,
     "inch": 25.4, "in": 25.4,
 }  # fmt: skip
 _RESOLUTION_UNITS = {2: 25.4, 3: 10.0}  # of the resolution tag: inch and centimetre in mm
+_NAMES = {"px": "pixel", "µm": "micron"}  # of ImageJ, whose descriptions are in ASCII
+_ONE = 1e-6  # mm by which sizes of pixels may differ from 1 and count as none
 _DEPTH, _CHANNELS = "ZQI", "CS"  # letters of tifffile for axes: depth or unnamed pages; channels or samples
 _DAMAGE_SIGNS = ("invalid offset", "invalid value offset", "invalid page offset", "corrupted")
 _ERRORS = (OSError, ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError, struct.error)
@@ -51,7 +54,7 @@ def read_tiff(path: Path) -> Image:
     try:
         with _log_messages() as messages, tifffile.TiffFile(path) as file:
             axes, shape = _require_one(file, path)
-            values, spacing = _values(file, path, shape), _spacing(file)
+            values, (spacing, unit) = _values(file, path, shape), _spacing(file)
             table = file.series[0].keyframe.colormap
     except InputError:
         raise
@@ -64,7 +67,7 @@ def read_tiff(path: Path) -> Image:
         axes, values = axes + "S", np.moveaxis(colours, 0, -1).astype(np.uint8)
     if np.iscomplexobj(values):
         raise InputError(f"{path} holds complex numbers; save their magnitude and give that")
-    return _image(axes, values, spacing, str(path))
+    return replace(_image(axes, values, spacing, str(path)), unit=unit)
 
 
 @contextmanager
@@ -112,22 +115,30 @@ def _values(file: "TiffFile", path: Path, shape: tuple[int, ...]) -> NDArray[np.
     return values.reshape(shape)
 
 
-def _spacing(file: "TiffFile") -> tuple[float, float, float]:
-    """Return the distances of pages, rows and columns in mm, 1 without tags."""
+def _spacing(file: "TiffFile") -> tuple[tuple[float, float, float], str]:
+    """Return the distances of pages, rows and columns in mm, 1 without tags, and the unit to show them in."""
     ome, imagej, page = file.ome_metadata, file.imagej_metadata, file.series[0].keyframe
     if ome and (found := _ome_spacing(ome)):
         return found
     tagged = "XResolution" in page.tags and page.resolution != (1, 1)
     down, across = (1 / r if 0 < r < math.inf else 1.0 for r in reversed(page.resolution))
-    depth, unit = 1.0, _RESOLUTION_UNITS.get(int(page.resolutionunit)) if tagged else None
+    depth, unit, shown = 1.0, _RESOLUTION_UNITS.get(int(page.resolutionunit)) if tagged else None, "mm"
     if imagej and imagej.get("unit"):
-        unit = _MILLIMETRES.get(str(imagej["unit"]).lower(), 1.0)
+        known = _MILLIMETRES.get(str(imagej["unit"]).lower())
+        unit, shown = known or 1.0, _shown(known)
         depth = float(imagej.get("spacing", 1.0)) * unit
-    return (abs(depth) or 1.0, down * unit, across * unit) if unit else (1.0, 1.0, 1.0)
+    if unit is None or (abs(down * unit - 1) + abs(across * unit - 1) < _ONE and not imagej):
+        return (1.0, 1.0, 1.0), "px"  # ITK writes the resolution of 1 mm where an image has none
+    return (abs(depth) or 1.0, down * unit, across * unit), shown
 
 
-def _ome_spacing(text: str) -> tuple[float, float, float] | None:
-    """Return PhysicalSizeZ, Y, X in mm, None if the description has no sizes or cannot be read."""
+def _shown(millimetres: float | None) -> str:
+    """Return the unit to show lengths in, by the length of the file's unit."""
+    return "px" if millimetres is None else "µm" if millimetres < 0.1 else "mm"
+
+
+def _ome_spacing(text: str) -> tuple[tuple[float, float, float], str] | None:
+    """Return PhysicalSizeZ, Y, X in mm and their unit; None if the description has no sizes or cannot be read."""
     try:
         pixels = ElementTree.fromstring(text).find(".//{*}Pixels")
     except ElementTree.ParseError:
@@ -137,7 +148,7 @@ def _ome_spacing(text: str) -> tuple[float, float, float] | None:
     units = [_MILLIMETRES.get(pixels.get(f"PhysicalSize{axis}Unit", "µm"), 1.0) for axis in "ZYX"]
     sizes = [float(pixels.get(f"PhysicalSize{axis}", "nan")) * unit for axis, unit in zip("ZYX", units, strict=True)]
     down, across, depth = sizes[1], sizes[2], sizes[0] if sizes[0] > 0 else 1.0
-    return (depth, down, across) if down > 0 and across > 0 else None
+    return ((depth, down, across), _shown(units[2])) if down > 0 and across > 0 else None
 
 
 def _image(axes: str, values: NDArray[np.generic], spacing: tuple[float, float, float], name: str) -> Image:
@@ -157,12 +168,13 @@ def _image(axes: str, values: NDArray[np.generic], spacing: tuple[float, float, 
     return Image(data, Grid(shape, tuple(spacing[k] for k in used)), name=name, pixel_type=kind)
 
 
-def write_tiff(values: NDArray[np.generic], spacing: Sequence[float], path: Path) -> None:
+def write_tiff(values: NDArray[np.generic], spacing: Sequence[float], unit: str, path: Path) -> None:
     """Write a volume as the pages of a TIFF for ImageJ, with the distance of the pages in its description.
 
     Args:
         values: ``(C, Z, Y, X)`` of a type that ImageJ has: uint8, uint16 or float32.
-        spacing: distances of pages, rows and columns in mm.
+        spacing: distances of pages, rows and columns in ``unit``.
+        unit: one of `UNITS`.
         path: the file.
     """
     import tifffile
@@ -175,5 +187,5 @@ def write_tiff(values: NDArray[np.generic], spacing: Sequence[float], path: Path
         imagej=True,
         photometric="rgb" if colour else "minisblack",
         resolution=(1 / across, 1 / down),
-        metadata={"axes": "ZYXS" if colour else "ZCYX", "spacing": depth, "unit": "mm"},
+        metadata={"axes": "ZYXS" if colour else "ZCYX", "spacing": depth, "unit": _NAMES.get(unit, unit)},
     )

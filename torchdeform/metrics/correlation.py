@@ -221,10 +221,10 @@ def _raised(covariance: Tensor) -> Tensor:
     return covariance + torch.full_like(covariance, LNCC_FLOOR).copysign(covariance)
 
 
-def contrast(variance: Tensor) -> Tensor:
-    """Return the weight v² / (v² + τ⁴) of windows with variance v in an image scaled to about [0, 1]."""
+def contrast(variance: Tensor, deviation: float = LNCC_CONTRAST) -> Tensor:
+    """Return the weight v² / (v² + τ⁴) of windows with variance v in an image scaled to about [0, 1], τ a deviation."""
     square = variance.square()
-    return square / (square + LNCC_CONTRAST**4)
+    return square / (square + deviation**4)
 
 
 def _moments(
@@ -250,6 +250,14 @@ def _products(warped: Tensor, fixed: Tensor, weight: Tensor | None) -> Tensor:
     return fields
 
 
+def local_contrast(image: Tensor, window: int) -> Tensor:
+    """Return the largest `contrast` of all channels in the windows around each voxel, ``(B, 1, *S)``."""
+    count = box_sum(torch.ones_like(image[:1, :1]), window)
+    middle = box_sum(image, window) / count
+    variance = box_sum(image * image, window) / count - middle * middle
+    return contrast(variance.clamp(min=0).amax(1, keepdim=True))
+
+
 # Images are multiplied by this in `ForegroundLNCC`, so that ε is small against τ² and hardly a window is flat.
 _GAIN = 10.0
 
@@ -268,12 +276,7 @@ class ForegroundLNCC(Similarity):
     """
 
     def __init__(self, fixed: Tensor, window: int) -> None:
-        self.lncc = LocalCrossCorrelation(fixed * _GAIN, window)
-        ones = torch.ones_like(fixed[:, :1])
-        count = box_sum(ones, window)
-        mean = box_sum(fixed, window) / count
-        variance = (box_sum(fixed * fixed, window) / count - mean * mean).clamp(min=0).amax(1, keepdim=True)
-        self.foreground = contrast(variance)
+        self.lncc, self.foreground = LocalCrossCorrelation(fixed * _GAIN, window), local_contrast(fixed, window)
 
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         weight = self.foreground.expand(len(warped), *self.foreground.shape[1:])

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
+from torchdeform.core.image import AUTO
 from torchdeform.errors import InputError, require_choice
-from torchdeform.metrics.base import Similarity
-from torchdeform.metrics.correlation import CrossCorrelation, LocalCrossCorrelation, lncc, ncc
+from torchdeform.metrics.base import Similarity, channel_mean, mean, relative_weight, weighted
+from torchdeform.metrics.correlation import CrossCorrelation, LocalCrossCorrelation, lncc, local_contrast, ncc
 from torchdeform.metrics.gradients import GradientFields, ngf
 from torchdeform.metrics.information import MutualInformation, mutual_information, normalised_mutual_information
 from torchdeform.metrics.mind import mind_ssc, neighbour_pairs
@@ -50,6 +51,9 @@ class Measure:
         time: time of a step over that of a step with LNCC.
         options: what both take of ``window`` (width in voxels) and ``grid``.
         features: what of the images is compared.
+        unrelated: returns S of features that have nothing to do with each other, from those of both images
+            ``(B, C', *S)``, their weight and S of the fixed ones with themselves; see `mark`.
+        weighs_contrast: whether S itself leaves out what has no contrast in the fixed image.
         common_scale: whether intensities are compared as they are, so that both images need one scale.
         references: keys in ``references.bib``; none for what is common property.
     """
@@ -60,6 +64,8 @@ class Measure:
     time: float
     options: tuple[str, ...] = ()
     features: Features = INTENSITIES
+    unrelated: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor] = lambda fixed, warped, weight, own: 0 * own
+    weighs_contrast: bool = False
     common_scale: bool = False
     references: tuple[str, ...] = ()
 
@@ -67,6 +73,9 @@ class Measure:
         """Return those of the options ``window`` and ``grid`` that this measure takes."""
         return {name: available[name] for name in self.options}
 
+
+# What ``auto`` chooses for most images.
+_USUAL = "lncc"
 
 # Windows of LNCC over a voxel along each axis. With 3 in place of 9 it takes a fifth of the time; Dice changes by
 # +0.002 (mouse brains), +0.001 (slices, hearts), 0.000 (hippocampi).
@@ -77,20 +86,51 @@ def _sparse_lncc(fixed: Tensor, window: int) -> Similarity:
     return LocalCrossCorrelation(fixed, window, max(1, window // _WINDOWS_OVER))
 
 
+def _variances(fixed: Tensor, warped: Tensor, weight: Tensor, own: Tensor) -> Tensor:
+    """Return −E |f − Ef + Ew − w|² − |Ef − Ew|² of independent f and w."""
+    share = relative_weight(weight, fixed)
+    middles = [channel_mean(x, share) for x in (fixed, warped)]
+    spread = [mean((x - m).square(), share) for x, m in zip((fixed, warped), middles, strict=True)]
+    return -(spread[0] + spread[1] + mean((middles[0] - middles[1]).square()))
+
+
 _NMI = partial(MutualInformation, normalised=True)
 _MI_PAPERS = ("viola1997alignment", "thevenaz2000optimization")
 
 # The one table of measures, by their names in settings: settings, layers, memory, time and citations all read it, so a
 # new measure is a new row.
 MEASURES = {
-    "ssd": Measure(ssd, MeanSquaredDifference, (60.0, 55.0), 0.7, common_scale=True),
+    "ssd": Measure(ssd, MeanSquaredDifference, (60.0, 55.0), 0.7, unrelated=_variances, common_scale=True),
     "ncc": Measure(ncc, CrossCorrelation, (60.0, 55.0), 0.7),
-    "lncc": Measure(lncc, _sparse_lncc, (45.0, 40.0), 1.0, ("window",), references=("avants2008symmetric",)),
+    "lncc": Measure(
+        lncc, _sparse_lncc, (45.0, 40.0), 1.0, ("window",), weighs_contrast=True, references=("avants2008symmetric",)
+    ),
     "mi": Measure(mutual_information, MutualInformation, (60.0, 50.0), 1.1, references=_MI_PAPERS),
-    "nmi": Measure(normalised_mutual_information, _NMI, (60.0, 50.0), 1.1, references=("studholme1999overlap",)),
-    "ngf": Measure(ngf, GradientFields, (75.0, 60.0), 1.0, ("grid",), references=("haber2006intensity",)),
+    "nmi": Measure(
+        normalised_mutual_information,
+        _NMI,
+        (60.0, 50.0),
+        1.1,
+        unrelated=lambda fixed, warped, weight, own: torch.ones_like(own),
+        references=("studholme1999overlap",),
+    ),
+    "ngf": Measure(
+        ngf,
+        GradientFields,
+        (75.0, 60.0),
+        1.0,
+        ("grid",),
+        unrelated=lambda fixed, warped, weight, own: own / (fixed.dim() - 2),  # the mean of cos² over all directions
+        references=("haber2006intensity",),
+    ),
     "mind": Measure(
-        mind, MeanSquaredDifference, (140.0, 300.0), 1.5, (), SELF_SIMILARITIES, references=("heinrich2013towards",)
+        mind,
+        MeanSquaredDifference,
+        (140.0, 300.0),
+        1.5,
+        features=SELF_SIMILARITIES,
+        unrelated=_variances,
+        references=("heinrich2013towards",),
     ),
 }
 
@@ -99,16 +139,17 @@ def similarity_weights(similarity: str | Mapping[str, float]) -> dict[str, float
     """Return the measures that a setting ``similarity`` names, with their weights.
 
     Args:
-        similarity: a name of `MEASURES`, which has weight 1, or names with their weights.
+        similarity: a name of `MEASURES`, which has weight 1, or names with their weights. ``auto`` is ``lncc`` for all
+            that cannot look at the images first.
 
     Raises:
         InputError: no name, an unknown one, or a weight that is not positive and finite.
     """
     if not isinstance(similarity, str | Mapping) or not similarity:
-        raise InputError(f"similarity must name one of {', '.join(MEASURES)}, or several with their weights")
-    weights = {similarity: 1.0} if isinstance(similarity, str) else dict(similarity)
+        raise InputError(f"similarity must be auto, name one of {', '.join(MEASURES)}, or several with their weights")
+    weights = {_USUAL if similarity == AUTO else similarity: 1.0} if isinstance(similarity, str) else dict(similarity)
     for name, weight in weights.items():
-        require_choice(name, MEASURES, "similarity")
+        require_choice(name, (*MEASURES, *([AUTO] if isinstance(similarity, str) else [])), "similarity")
         if isinstance(weight, bool) or not isinstance(weight, Real) or not 0 < weight < math.inf:
             raise InputError(f"similarity: the weight of {name} must be a positive finite number, got {weight!r}")
     return weights
@@ -206,3 +247,41 @@ def _channels(similarity: str | Mapping[str, float], total: int, dim: int) -> di
     ends = [0, *accumulate(kind.count(dim) for kind in kinds)]
     size = total // ends[-1]
     return {kind: slice(size * a, size * b) for kind, (a, b) in zip(kinds, pairwise(ends), strict=True)}
+
+
+def mark(
+    similarity: str | Mapping[str, float],
+    fixed: Tensor,
+    warped: Tensor,
+    *,
+    mask: Tensor | None = None,
+    window: int = 9,
+    grid: Grid | None = None,
+) -> Tensor:
+    """Return (S − N) / (S of fixed with itself − N), N being S of unrelated images: 1 at best, about 0 for noise.
+
+    Args:
+        similarity: a name, or names with weights.
+        fixed: ``(B, C, *S)``, scaled to about [0, 1].
+        warped: the same shape, likewise.
+        mask: weight of each voxel ``(B, 1, *S)``, 0 to 1; all ones when None.
+        window: width of the LNCC window in voxels, and of those in which the contrast of the fixed image is measured.
+        grid: their grid; spacing 1 when None.
+
+    Returns:
+        ``(B,)``: S is averaged over what has contrast in the fixed image; several measures by their weights. N is 0 for
+        ``lncc``, ``ncc`` and ``mi``, 1 for ``nmi``, 1/D of the image with itself for ``ngf``. For ``ssd`` and ``mind``
+        it is minus the sum of both variances and of the squared difference of the means, which makes it the
+        concordance correlation of Lin, "A concordance correlation coefficient to evaluate reproducibility", 1989.
+    """
+    grid, total = grid or Grid(tuple(fixed.shape[2:])), fixed.new_zeros(len(fixed))
+    seen = weighted(local_contrast(fixed, window), mask)
+    for name, share in similarity_weights(similarity).items():
+        measure = MEASURES[name]
+        f, w = (measure.features.of(image) for image in (fixed, warped))
+        weight = (torch.ones_like(seen) if mask is None else mask) if measure.weighs_contrast else seen
+        made = measure.closed_form(f, **measure.choose(window=window, grid=grid))
+        value, own = (made.evaluate(x, weight)[0] for x in (w, f))
+        unrelated = measure.unrelated(f, w, weight, own)
+        total += share * (value - unrelated) / (own - unrelated).clamp(min=torch.finfo(own.dtype).tiny)
+    return total / sum(similarity_weights(similarity).values())

@@ -103,7 +103,7 @@ def adapt_grid_to_file(image: Path, out: Path, settings: GridSettings, device: t
     u = grid_from_target_monitor(f, grid, velocity=settings.velocity)
     points = grid.points(dtype=u.dtype, device=u.device) + u
     error = (jacobian_determinant(u, grid) / sample(f, points, grid) - 1).abs()
-    record = _described(image, u, grid) | {
+    record = _described(image, u, picture) | {
         "settings": vars(settings),
         "monitor_min": f.min().item(),
         "monitor_max": f.max().item(),
@@ -114,7 +114,7 @@ def adapt_grid_to_file(image: Path, out: Path, settings: GridSettings, device: t
         write_displacement(u.cpu(), picture, folder / "displacement.nii.gz")
         write_image(replace(picture, data=f.cpu(), pixel_type="float32"), folder / "monitor.nii.gz")
         write_grids(folder / "grid.png", {"adapted grid": points.cpu()}, _background(picture))
-        write_json(record, folder / "result.json")
+        _finish(record, folder)
     return record
 
 
@@ -149,7 +149,7 @@ def reconstruct_file(
     if solution.status[0] not in (Status.CONVERGED, Status.ROUNDING):
         raise ComputationError(f"{displacement}: the reconstruction did not converge: {solution.status[0].value}")
     distance = (solution.value - u).norm(dim=1)
-    record = _described(displacement, solution.value, grid) | {
+    record = _described(displacement, solution.value, given) | {
         "settings": {"order": order, "refine": refine, "steps": steps},
         "distance_max": distance.max().item(),
         "distance_mean": distance.mean().item(),
@@ -162,7 +162,7 @@ def reconstruct_file(
         for step, moved in enumerate(trajectory, start=1):
             write_displacement(moved, given, folder / f"step_{step:0{len(str(len(trajectory)))}}.nii.gz")
         write_grids(folder / "grids.png", _reconstruction_grids(u.cpu(), solution.value.cpu(), trajectory, grid))
-        write_json(record, folder / "result.json")
+        _finish(record, folder)
     return record
 
 
@@ -211,7 +211,7 @@ def simulate_file(
         off = f"the volumes differ by {change.residual.item():.2%} from those asked for"
         raise ComputationError(f"{labels}: {off}; ask for less, or lower --smoothing")
     u, back = change.value, invert(change.value, grid)
-    record = _described(image, u, grid) | {
+    record = _described(image, u, picture) | {
         "labels": str(labels),
         "volumes": [
             {"label": label, "asked": factors[label], "reached": reached.item()}
@@ -227,7 +227,7 @@ def simulate_file(
         write_transform(back, picture, folder / "transform.h5")
         write_transform(u, picture, folder / "inverse.h5")
         write_grids(folder / "grid.png", {"moved grid": grid.points(dtype=u.dtype) + u}, _background(changed))
-        write_json(record, folder / "result.json")
+        _finish(record, folder)
     return record
 
 
@@ -243,12 +243,20 @@ def _background(image: Image) -> Tensor | None:
     return to_unit(grey(image), grey(image)) if image.grid.dim == 2 else None
 
 
-def _described(source: Path, u: Tensor, grid: Grid) -> Record:
+def _finish(record: Record, folder: Path) -> None:
+    """Write the record of a folder of results, with the names of its files."""
+    record["files"] = [*sorted(path.name for path in folder.iterdir()), "result.json"]
+    write_json(record, folder / "result.json")
+
+
+def _described(source: Path, u: Tensor, place: Image) -> Record:
     """Return what the records of all three commands have in common."""
+    grid = place.grid
     return {
         "source": str(source),
         "size": grid.shape[::-1],
-        "spacing": grid.spacing[::-1],
+        "unit": place.unit,
+        "spacing": [place.in_unit(length) for length in grid.spacing[::-1]],
         **describe_map(diagnose(u, grid)),
         "displacement_max_voxels": voxels(u, grid).max().item(),
         "versions": versions(),

@@ -44,7 +44,7 @@ _FILES = {2: (65.0, 48.0), 3: (80.0, 26.0)}
 
 def choices(settings: RegistrationSettings) -> tuple[dict[str, Measure], bool, bool]:
     """Return what the cost of a registration depends on: its measures, a discrete start or not, symmetric or not."""
-    return measures_in(settings.similarity.measure), settings.start == "discrete", settings.symmetric
+    return measures_in(settings.similarity.measure), settings.starts_discretely, settings.symmetric
 
 
 def footprint(grid: Grid, channels: int, settings: RegistrationSettings) -> int:

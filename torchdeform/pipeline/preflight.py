@@ -1,10 +1,12 @@
 """The check of two images before they are registered: what looks wrong with them, and what to do about it."""
 
 import math
+import re
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -15,6 +17,7 @@ from torchdeform.core.intensities import corresponding_channels, intensity_range
 from torchdeform.core.resampling import MIN_NODES
 from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
+from torchdeform.io.files import stem
 from torchdeform.metrics.similarity import needs_common_scale
 from torchdeform.pipeline.memory import available, footprint, readable
 from torchdeform.registration.settings import RegistrationSettings
@@ -30,6 +33,10 @@ _FILLED = 0.5  # share of the image without its empty margins
 _FITS = 0.6  # correlation that a flipped image must reach
 _BETTER = 0.25  # and it must be this much better than the image as it is, or this share closer to 1
 _BLOCKS = {2: 48, 3: 24}  # blocks along an axis of the images that are flipped
+
+# What is taken for labels: by the name of the file, by the number of values, by the share of equal neighbours.
+_LABEL_NAME = re.compile(r"(?<![a-z])(a?seg|segmentation|labels?|masks?|parcellation)(?![a-z])")
+_MOST_LABELS, _SAME = 1000, 0.5
 
 
 @dataclass(frozen=True)
@@ -119,6 +126,27 @@ def preflight(
     return Report(tuple(sorted(found, key=lambda finding: order.index(finding.severity))))
 
 
+def looks_like_labels(image: Image) -> bool:
+    """Return whether an image seems to hold labels, whose values must not be mixed.
+
+    Args:
+        image: as `read_image` reads it.
+
+    Notes:
+        Its name says so, or its values are whole numbers of which most have a neighbour with the same value, the
+        commonest value, the background, left aside. Grey values differ from their neighbours.
+    """
+    if _LABEL_NAME.search(stem(Path(image.name)).lower()):
+        return True
+    data = image.data
+    if data.shape[1] > 1 or not bool((data == data.round()).all()):
+        return False
+    values, counts = data.unique(return_counts=True)
+    inside = data != values[counts.argmax()]
+    same = (data[..., 1:] == data[..., :-1])[inside[..., 1:]]
+    return len(values) <= _MOST_LABELS and bool(same.float().mean() > _SAME)
+
+
 def _check_values(image: Image) -> Iterator[Finding]:
     """NaN, infinity, constant images, images that are 0 nearly everywhere."""
     low, high = (float(end) for end in image.data.aminmax())
@@ -142,8 +170,9 @@ def _check_nodes(image: Image, severity: str) -> Iterator[Finding]:
 def _check_spacing(image: Image, partner: Image) -> Iterator[Finding]:
     least, most = _SPACINGS
     if min(image.grid.spacing) < least or max(image.grid.spacing) > most:
-        shown = "×".join(f"{h:.4g}" for h in image.grid.spacing[::-1])
-        yield Finding(WARNING, f"{image.name} has a spacing of {shown} mm; if that is not so, correct it in the header")
+        shown = "×".join(f"{image.in_unit(h):.4g}" for h in image.grid.spacing[::-1])
+        text = f"{image.name} has a spacing of {shown} {image.unit}; if that is not so, correct it in the header"
+        yield Finding(WARNING, text)
     if set(image.grid.spacing) == {1.0} and set(partner.grid.spacing) != {1.0}:
         text = (
             f"{image.name} has spacing 1 on all axes, as files without a spacing have, but {partner.name} has another"
@@ -174,7 +203,8 @@ def _has_contrast(image: Image, axis: int) -> Tensor:
 def _check_size(fixed: Image, moving: Image) -> Iterator[Finding]:
     sides = [math.prod(image.grid.extent) ** (1 / image.grid.dim) for image in (fixed, moving)]
     if max(sides) / min(sides) > _SIZE_RATIO:
-        sizes = f"{fixed.name} is {sides[0]:.4g} mm wide and {moving.name} {sides[1]:.4g} mm"
+        first, second = (f"{im.in_unit(side):.4g} {im.unit}" for im, side in zip((fixed, moving), sides, strict=True))
+        sizes = f"{fixed.name} is {first} wide and {moving.name} {second}"
         yield Finding(WARNING, f"{sizes}; check the spacings, or crop the larger one")
 
 

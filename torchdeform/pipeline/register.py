@@ -11,11 +11,12 @@ from torch import Tensor
 
 from torchdeform.core.image import Image, resample
 from torchdeform.core.resampling import restrict
+from torchdeform.core.stages import begin
 from torchdeform.core.transform import Transform
 from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.io import read_image, write_displacement, write_image, write_transform
 from torchdeform.io.files import atomic_folder, require_writable
-from torchdeform.io.images import ending_like, read_labels, read_optional, write_labels
+from torchdeform.io.images import ending_like, read_labels, read_optional, require_storable, write_labels
 from torchdeform.io.points import matched, read_points
 from torchdeform.metrics.evaluation import common_labels
 from torchdeform.pipeline.memory import available, fitting_grid, footprint, peak, readable
@@ -27,11 +28,15 @@ from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.figures import write_overview
 from torchdeform.report.page import write_report
 from torchdeform.report.record import describe, repeat_command, write_json
-from torchdeform.report.report_data import make_report_data
+from torchdeform.report.report_data import ReportData, make_report_data
+from torchdeform.report.thumbnail import write_thumbnail
 
 DEVICES = ("auto", "cpu", "cuda")
+REPORTS = ("none", "light", "full")
 RECORD = "result.json"
 REPORT = "report.html"
+OVERVIEW = "overview.png"
+THUMBNAIL = "thumb.jpg"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +46,8 @@ class PairFiles:
     Args:
         fixed: image that stays.
         moving: image that is warped onto it.
-        out: folder for the results; created if missing. Results of an earlier run are replaced, other files stay.
+        out: folder for the results; created if missing. Results of an earlier run of this pair are replaced, other
+            files stay.
         fixed_mask: where the fixed image counts (not 0).
         moving_mask: where the moving image counts (not 0).
         fixed_points: landmarks of the fixed image, see `read_points`.
@@ -134,6 +140,7 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
         memory=memory,
     )
     report.require_ok()
+    require_storable(settings.outside, ending_like(files.moving, moving), moving)
     labels = [None if path is None else read_labels(path) for path in (files.fixed_labels, files.moving_labels)]
     annotations = Annotations(
         fixed_mask=masks[0],
@@ -163,6 +170,8 @@ def register_files(
     *,
     device: str = "auto",
     memory: int | None = None,
+    report: str = "full",
+    overwrite: bool = False,
     callback: Callback | None = None,
 ) -> Outcome:
     """Register two image files and write the results into a folder.
@@ -173,17 +182,24 @@ def register_files(
         device: ``auto``, ``cpu`` or ``cuda``.
         memory: bytes to use at most; the finest level is coarsened to fit. When None, all that is free, and a pair
             that does not fit is an error.
+        report: ``full`` draws ``report.html`` and ``overview.png``; ``light`` draws the middle slices alone, and a
+            ``thumb.jpg``; ``none`` draws nothing.
+        overwrite: also replace results of another pair.
         callback: is called with every step.
 
     Raises:
-        InputError: the files, the device or the folder cannot be used, or there is not enough memory. This is checked
-            before any long work.
+        InputError: the files, the device or the folder cannot be used, the folder has results of another pair, or
+            there is not enough memory. This is checked before any long work.
         ComputationError: the registration failed. Nothing is written then.
     """
     from torchdeform.registration.deformable import register
 
     where, start = choose_device(device), perf_counter()
+    require_choice(report, REPORTS, "report")
     require_writable(files.out)
+    if not overwrite:
+        _require_own(files)
+    begin("reading")
     inputs = read_inputs(files, settings, memory)
     fixed, notes = _fit_to_memory(inputs.fixed, settings, memory, where)
     run = _Run(memory, {"read": perf_counter() - start}, {"read": peak()})
@@ -194,7 +210,7 @@ def register_files(
     _require_finite(result)
     run.peaks[next(reversed(result.seconds), "register")] = peak()
     found = result.alignment.warnings if result.alignment else ()
-    return _write_results(files, replace(inputs, warnings=(*inputs.warnings, *notes, *found)), result, run)
+    return _write_results(files, replace(inputs, warnings=(*inputs.warnings, *notes, *found)), result, run, report)
 
 
 @dataclass(frozen=True)
@@ -232,24 +248,39 @@ def _require_finite(result: RegistrationResult) -> None:
         raise ComputationError("the registration diverged: its map is not finite; try --preset default without --set")
 
 
-def _write_results(files: PairFiles, inputs: Inputs, result: RegistrationResult, run: _Run) -> Outcome:
+def _write_results(files: PairFiles, inputs: Inputs, result: RegistrationResult, run: _Run, report: str) -> Outcome:
     """Write all files of a result into the folder, or none."""
+    begin("writing")
     out, start = files.out, perf_counter()
     earlier = _earlier_files(out)
     with atomic_folder(out) as folder:
         _write_images(folder, files, inputs, result)
         written = perf_counter()
-        data = make_report_data(inputs.fixed, inputs.moving, result, annotations=inputs.annotations)
-        write_overview(folder / "overview.png", data)
-        names = (*sorted([*(path.name for path in folder.iterdir()), REPORT]), RECORD)
+        begin("drawing")
+        data = _draw(folder, inputs, result, report)
+        pages = [] if data is None else [REPORT]
+        names = (*sorted([*(path.name for path in folder.iterdir()), *pages]), RECORD)
         run.seconds.update(result.seconds, write=written - start, draw=perf_counter() - written)
         run.peaks["draw"] = peak()
         record = _record(files, inputs, result, run) | {"files": names}
-        write_report(folder / REPORT, data, record)
+        if data is not None:
+            write_report(folder / REPORT, data, record)
         write_json(record, folder / RECORD)
     for name in earlier - set(names):
         (out / name).unlink(missing_ok=True)
     return Outcome(result, record, out)
+
+
+def _draw(folder: Path, inputs: Inputs, result: RegistrationResult, report: str) -> ReportData | None:
+    """Draw the pictures of a report, and return its data; None if there is none."""
+    if report == "none":
+        return None
+    light, annotations = report == "light", inputs.annotations
+    data = make_report_data(inputs.fixed, inputs.moving, result, annotations=annotations, light=light)
+    write_overview(folder / OVERVIEW, data)
+    if light:
+        write_thumbnail(folder / THUMBNAIL, data)
+    return data
 
 
 def _record(files: PairFiles, inputs: Inputs, result: RegistrationResult, run: _Run) -> dict[str, Any]:
@@ -281,10 +312,29 @@ def _write_images(folder: Path, files: PairFiles, inputs: Inputs, result: Regist
         write_labels(labels, folder / f"warped_labels{ending_like(files.moving_labels, labels)}")
 
 
+def _earlier_record(out: Path) -> dict[str, Any]:
+    """Return the record that an earlier run left in ``out``; empty if there is none, or none that can be read."""
+    try:
+        record = json.loads((out / RECORD).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
 def _earlier_files(out: Path) -> set[str]:
     """Return the names that an earlier run recorded in ``out``, so that none of its results stays."""
-    try:
-        names = json.loads((out / RECORD).read_text(encoding="utf-8"))["files"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return set()
-    return {name for name in names if isinstance(name, str) and Path(name).name == name}
+    names = _earlier_record(out).get("files")
+    return {n for n in names if isinstance(n, str) and Path(n).name == n} if isinstance(names, list) else set()
+
+
+def _require_own(files: PairFiles) -> None:
+    """Raise `InputError` if the folder has results of something else than these two images."""
+    record = _earlier_record(files.out)
+    if not record:
+        return
+    given = record.get("inputs")
+    known = {side: given.get(side) for side in ("fixed", "moving")} if isinstance(given, dict) else {}
+    start = Path(str(record.get("folder", "")))  # where the command ran; its paths may be relative to it
+    if any((start / str(known.get(side))).resolve() != getattr(files, side).resolve() for side in ("fixed", "moving")):
+        of = " to ".join(str(known[side]) for side in ("moving", "fixed")) if known else "another command"
+        raise InputError(f"{files.out} has the results of {of}; choose another folder with --out, or add --overwrite")

@@ -12,13 +12,15 @@ from torchdeform.core.grid import Grid, limit_threads
 from torchdeform.core.image import Image, resample, same_place
 from torchdeform.core.intensities import require_finite
 from torchdeform.core.resampling import MIN_NODES, prolong
+from torchdeform.core.stages import begin
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import invert, warp
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.metrics.evaluation import evaluate_images, evaluate_tensors
-from torchdeform.registration.affine.align import Alignment, align
+from torchdeform.metrics.similarity import mark
 from torchdeform.registration.discrete import discrete_start
-from torchdeform.registration.optimise import forward_similarity, optimise_levels
+from torchdeform.registration.optimise import best_map, common_mask, forward_objective, optimise_levels
+from torchdeform.registration.placement import Placement, choose, place, problem_at
 from torchdeform.registration.problem import (
     Annotations,
     PlacedImage,
@@ -26,7 +28,6 @@ from torchdeform.registration.problem import (
     moved,
     placed_images,
     problem_of_tensors,
-    resample_pair,
 )
 from torchdeform.registration.result import Callback, LevelRecord, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
@@ -46,7 +47,7 @@ def register(
     config: RegistrationSettings | None = None,
     *,
     annotations: Annotations | None = None,
-    affine: Affine | None = None,
+    affine: Affine | Placement | None = None,
     start: Tensor | None = None,
     callback: Callback | None = None,
 ) -> RegistrationResult:
@@ -57,8 +58,8 @@ def register(
         moving: image that is warped; a tensor of the same shape, or an `Image` anywhere in the same world.
         config: settings; those of the preset ``default`` when None.
         annotations: masks, landmarks and labels.
-        affine: map A from the world of the fixed image to that of the moving one, for images; when None, that which
-            `align` finds as ``config.align`` says.
+        affine: map A from the world of the fixed image to that of the moving one, for images, or what `place` returned
+            for them; when None, that which `align` finds as ``config.align`` says.
         start: displacement ``(B, D, *S)`` in units of spacing to begin with, fold-free; what the coarsest level cannot
             hold of it is found again or lost. What ``config.start`` says when None.
         callback: is shown every step.
@@ -76,9 +77,10 @@ def register(
         One step: force = N ∂S/∂warped ∇warped; K v = M force + load of a divergence where the map is nearly folded, K
         being the div-curl least squares with w_d, w_c and w_0 = w_d / length²; φ ← φ ∘ flow(v), the longest move being
         ``step_length`` voxels, less where a one-sided determinant would fall below ``min_determinant``. A level keeps
-        its most similar map. Items of a batch do not influence each other. Liu, Liao & Xue 2007, section 2, with the
-        controls driven by the images. Landmarks add the force of their squared distance at the points. With
-        ``symmetric`` two maps from a space between move against each other, and φ = φ_m ∘ φ_f⁻¹.
+        its most similar map, and the result is never less similar than its start, over the same voxels. Items of a
+        batch do not influence each other. Liu, Liao & Xue 2007, section 2, with the controls driven by the images.
+        Landmarks add the force of their squared distance at the points. With ``symmetric`` two maps from a space
+        between move against each other, and φ = φ_m ∘ φ_f⁻¹.
     """
     settings, annotations = config or RegistrationSettings(), annotations or Annotations()
     if isinstance(fixed, Image) and isinstance(moving, Image):
@@ -101,6 +103,7 @@ def _register_tensors(
     grid = _checked_grid(fixed, moving, annotations)
     problem = problem_of_tensors(fixed, moving, grid, annotations)
     require_finite(problem.fixed, problem.moving, "register")
+    settings, choice = choose(problem, settings)
     problem = problem.scaled(settings)
     space = midspace_of_tensors(problem) if settings.symmetric else None
     found = _optimise(problem, space, settings, start, callback)
@@ -108,7 +111,7 @@ def _register_tensors(
     with limit_threads(len(found.u), grid):
         warped = warp(moving, found.u, grid)
         evaluation = evaluate_tensors(found.u, grid, labels=annotations.labels, points=annotations.points)
-    return replace(_result(found, grid, warped, settings), evaluation=evaluation)
+    return replace(_result(found, grid, warped, settings), evaluation=evaluation, choice=choice)
 
 
 def _checked_grid(fixed: Tensor, moving: Tensor, annotations: Annotations) -> Grid:
@@ -134,38 +137,31 @@ def _register_images(
     moving: Image,
     settings: RegistrationSettings,
     annotations: Annotations,
-    affine: Affine | None,
+    affine: Affine | Placement | None,
     start: Tensor | None,
     callback: Callback | None,
 ) -> RegistrationResult:
     """Take the moving image onto the fixed grid in its physical place, register, and sample the original once."""
     _require_size(fixed.grid)
     annotations.require_images(fixed.grid.dim)
-    both, alignment = placed_images(fixed, moving, annotations), None
-    if affine is None and settings.align.kind != "none":
-        alignment = _align(fixed, moving, settings, annotations)
-        affine = alignment.affine
-    aligned = both[1] if affine is None else both[1].moved(affine.inverse())
-    problem = resample_pair(both[0], aligned, fixed).scaled(settings)
+    placed = affine if isinstance(affine, Placement) else place(fixed, moving, settings, annotations, affine)
+    both, settings, affine = placed_images(fixed, moving, annotations), placed.settings, placed.affine
+    problem = problem_at(*both, affine).scaled(settings)
     space = _midspace(*both, problem, affine, settings) if settings.symmetric else None
     found = _optimise(problem, space, settings, start, callback)
     del problem, space
-    warped = _warped(fixed, moving, affine, found.u)
-    result = _result(found, fixed.grid, warped, settings)
+    warped = _warped(fixed, moving, affine, found.u, settings)
+    alignment, result = placed.alignment, _result(found, fixed.grid, warped, settings)
     return replace(
         result,
         affine=affine,
         alignment=alignment,
+        choice=placed.choice,
+        similarity_before=result.similarity_before if placed.unaligned is None else placed.unaligned,
+        similarity_aligned=result.similarity_before if alignment else None,
         evaluation=evaluate_images(fixed, affine, found.u, labels=annotations.labels, points=annotations.points),
         seconds=({"align": alignment.seconds} if alignment else {}) | result.seconds,
     )
-
-
-def _align(fixed: Image, moving: Image, settings: RegistrationSettings, annotations: Annotations) -> Alignment:
-    """Align as the settings say, with masks."""
-    masks = (annotations.fixed_mask, annotations.moving_mask)
-    first, second = (mask if isinstance(mask, Image) else None for mask in masks)
-    return align(fixed, moving, fixed_mask=first, moving_mask=second, settings=settings.align)
 
 
 def _midspace(
@@ -182,20 +178,20 @@ def _midspace(
     return replace(space, problem=space.problem.scaled(settings))
 
 
-def _warped(fixed: Image, moving: Image, affine: Affine | None, u: Tensor) -> Tensor:
+def _warped(fixed: Image, moving: Image, affine: Affine | None, u: Tensor, settings: RegistrationSettings) -> Tensor:
     """Return the moving image on the fixed grid, sampled once."""
     seen = moving if affine is None else moved(moving, affine.inverse())
-    return resample(seen, fixed, u).to(moving.data.dtype)
+    return resample(seen, fixed, u, outside=settings.outside).to(moving.data.dtype)
 
 
 @dataclass(frozen=True)
 class _Optimised:
-    """Where the loop ended: the displacement on the fixed grid, how each level went, similarities, seconds."""
+    """Where the loop ended: the displacement on the fixed grid, how each level went, S and its mark, seconds."""
 
     u: Tensor
     records: tuple[LevelRecord, ...]
-    before: Tensor
-    after: Tensor
+    objective: tuple[Tensor, ...]
+    marks: tuple[Tensor, ...]
     seconds: float
 
 
@@ -210,7 +206,8 @@ def _optimise(
     began = perf_counter()
     if start is not None:
         start = _checked_start(start, problem)
-    elif settings.start == "discrete":
+    elif settings.starts_discretely:
+        begin("searching")
         start = discrete_start(
             problem.fixed, problem.moving, problem.grid, mask=problem.fixed_mask, settings=settings.discrete
         )
@@ -219,9 +216,20 @@ def _optimise(
     else:
         u, records = optimise_levels(problem, settings, start, callback)
     with limit_threads(len(u), problem.grid):
-        similarity = forward_similarity(problem, settings)
-        before, after = similarity.evaluate()[1], similarity.evaluate(u)[1]
-    return _Optimised(u, records, before, after, perf_counter() - began)
+        objective = forward_objective(problem, problem.grid, settings)
+        zero = torch.zeros_like(u)
+        u = best_map(objective, settings, u, zero if start is None else start, zero)
+        values = objective.similarity.on_common_voxels([zero, u])
+        marks = _marks(problem, settings, zero, u)
+    return _Optimised(u, records, tuple(values), marks, perf_counter() - began)
+
+
+def _marks(problem: RegistrationProblem, settings: RegistrationSettings, *maps: Tensor) -> tuple[Tensor, ...]:
+    """Return the `mark` of the images warped by each of the maps, over the voxels that all of them see."""
+    grid, chosen = problem.grid, settings.similarity
+    mask = common_mask(problem.fixed_mask, problem.moving_mask, maps, grid)
+    found = (warp(problem.moving, u, grid) for u in maps)
+    return tuple(mark(chosen.measure, problem.fixed, w, mask=mask, window=chosen.window, grid=grid) for w in found)
 
 
 def _checked_start(start: Tensor, problem: RegistrationProblem) -> Tensor:
@@ -236,6 +244,7 @@ def _checked_start(start: Tensor, problem: RegistrationProblem) -> Tensor:
 
 def _result(found: _Optimised, grid: Grid, warped: Tensor, settings: RegistrationSettings) -> RegistrationResult:
     """Invert the map and measure it."""
+    begin("inverting")
     with limit_threads(len(found.u), grid):
         start = perf_counter()
         inverse = invert(found.u, grid)
@@ -246,8 +255,10 @@ def _result(found: _Optimised, grid: Grid, warped: Tensor, settings: Registratio
             inverse=inverse,
             warped=warped,
             grid=grid,
-            similarity_before=found.before,
-            similarity_after=found.after,
+            similarity_before=found.marks[0],
+            similarity_after=found.marks[1],
+            objective_before=found.objective[0],
+            objective_after=found.objective[1],
             diagnosis=_require_sound(found.u, grid),
             inverse_error_mean=mean,
             inverse_error_max=largest,
@@ -289,7 +300,7 @@ def resample_result(
         displacement=u,
         inverse=inverse,
         grid=grid,
-        warped=_warped(fixed, moving, result.affine, u),
+        warped=_warped(fixed, moving, result.affine, u, result.settings),
         diagnosis=diagnose(u, grid),
         inverse_error_mean=mean,
         inverse_error_max=largest,

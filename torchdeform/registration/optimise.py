@@ -1,7 +1,7 @@
 """The loop of every registration: forces of the images give velocities by least squares, whose flows move the maps."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from time import perf_counter
@@ -38,6 +38,9 @@ _PATIENCE = 5
 # Levels whose images have more nodes than this carry the map on the coarser grid of `OptimiserSettings.map_spacing`.
 # Mouse brains (10^6 nodes) gain 0.003 Dice and half of the time by it; slices and hippocampi (7·10^4) would lose 0.01.
 _LARGE = 2**17
+
+# A similarity that is higher by a smaller share of itself is not higher: its last bits depend on the sums.
+_ROUNDING = 1e-6
 
 # How often a step that would fold is halved before it is left out.
 _HALVINGS = 6
@@ -86,10 +89,22 @@ class SimilarityTerm:
         mask = mask if self.fixed_mask is None else mask * self.fixed_mask
         return warped, *self.similarity.evaluate(warped.contiguous(), mask)
 
+    def on_common_voxels(self, maps: Sequence[Tensor]) -> list[Tensor]:
+        """Return S of the images warped by each of the maps ``(B, D, *S)``, over the voxels that all of them see."""
+        mask = common_mask(self.fixed_mask, self.masks, maps, self.grid)
+        return [self.similarity.evaluate(warp(self.images, u, self.grid), mask)[0] for u in maps]
+
     @cached_property
     def _masked(self) -> Tensor:
         """The images and their masks, side by side: one sampling costs less than two."""
         return self.images if self.masks is None else torch.cat([self.images, self.masks], dim=1)
+
+
+def common_mask(fixed: Tensor | None, moving: Tensor | None, maps: Sequence[Tensor], grid: Grid) -> Tensor | None:
+    """Return the weights ``(B, 1, *S)`` of the voxels that the fixed mask and all the warped ones leave, None for 1."""
+    masks = [] if fixed is None else [fixed]
+    masks += [] if moving is None else [warp(moving, u, grid) for u in maps]
+    return torch.stack(masks).prod(0) if masks else None
 
 
 def forward_similarity(problem: RegistrationProblem, settings: RegistrationSettings) -> SimilarityTerm:
@@ -153,6 +168,10 @@ class Level:
         """The grid of the level's images."""
         return self.objective.similarity.grid.shape
 
+    def at_images(self, u: Tensor) -> Tensor:
+        """Return the maps ``(B, D, *S)`` on the grid of the images."""
+        return u if self.transfer is None else self.transfer.up(u)
+
     @property
     def zero(self) -> Tensor:
         """Maps that are the identity, ``(B, D, *S)``."""
@@ -215,7 +234,8 @@ def optimise_levels(
         u = level.zero if u is None else repair_folds(prolong(u, level.grid), level.grid)
         with limit_threads(len(u), grid):
             state = optimise_level(level, u, callback)
-        u = state.best
+            checked = level.objective.similarity.masks is not None  # all voxels count in all maps without
+            u = best_map(level.objective, settings, state.best, u, level=level) if checked else state.best
         records.append(LevelRecord(level.shape, state.values, state.shortened, perf_counter() - began))
     if u is None:
         raise InputError("register: optimiser.steps must hold one number per level")
@@ -274,11 +294,33 @@ def optimise_level(
     return state
 
 
+def best_map(objective: Objective, settings: RegistrationSettings, *maps: Tensor, level: Level | None = None) -> Tensor:
+    """Return for each item the map with the highest goal over the same voxels, the last of equal ones.
+
+    A map that moves what does not fit out of the image, or out of the mask, would else seem better than it is.
+
+    Args:
+        objective: what counts.
+        settings: the settings.
+        maps: displacements ``(B, D, *S)``.
+        level: whose maps they are; None for maps on the grid of the images.
+    """
+    values = objective.similarity.on_common_voxels([level.at_images(u) if level else u for u in maps])
+    if objective.landmarks:
+        distances = [objective.landmarks.evaluate(u).distance for u in maps]
+        values = [v - settings.points_weight * d for v, d in zip(values, distances, strict=True)]
+    *others, (best, top) = zip(maps, values, strict=True)
+    for u, value in reversed(others):
+        better = value > top + _ROUNDING * value.abs()
+        best, top = where_items(better, u, best), where_items(better, value, top)
+    return best
+
+
 def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     """Return the state after one step, and whether it was the last."""
     settings, objective, grid = level.settings, level.objective, level.grid
     # 1. Evaluate: warp the images, compare them, and see how far the landmarks are apart.
-    at_images = state.u if level.transfer is None else level.transfer.up(state.u)
+    at_images = level.at_images(state.u)
     warped, value, slope = objective.similarity.evaluate(at_images)
     points = objective.landmarks.evaluate(state.u) if objective.landmarks else None
     del at_images

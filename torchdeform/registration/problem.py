@@ -117,8 +117,16 @@ class RegistrationProblem:
         """The landmarks of both images, None without."""
         return _both(self.fixed_points, self.moving_points)
 
+    @property
+    def mask(self) -> Tensor | None:
+        """The weights of both masks, None for 1 everywhere."""
+        given = [mask for mask in (self.fixed_mask, self.moving_mask) if mask is not None]
+        return torch.stack(torch.broadcast_tensors(*given)).prod(0) if given else None
+
     def on(self, coarse: Grid) -> "RegistrationProblem":
         """Return the problem on a coarser grid of the same box."""
+        if coarse == self.grid:
+            return self
 
         def coarser(field: Tensor | None) -> Tensor | None:
             return None if field is None else restrict(field, self.grid, coarse)

@@ -64,8 +64,11 @@ class RegistrationResult:
         inverse: displacement of φ⁻¹ on the same grid; takes points of the moving space to the fixed space.
         warped: moving image seen through φ ``(B, C, *S)``.
         grid: the fixed grid.
-        similarity_before: similarity of fixed and moving ``(B,)``, higher is better.
-        similarity_after: similarity of fixed and warped ``(B,)``.
+        similarity_before: `mark` of fixed and moving ``(B,)`` in their own place: 1 for equal images, about 0 for
+            unrelated ones.
+        similarity_after: that of fixed and warped ``(B,)``.
+        objective_before: what was maximised where the deformation began, ``(B,)``; higher is better.
+        objective_after: the same at the end, over the same voxels.
         diagnosis: determinants and folds of φ.
         inverse_error_mean: mean over x of |φ(φ⁻¹(x)) − x| in voxels ``(B,)``.
         inverse_error_max: its maximum ``(B,)``.
@@ -76,6 +79,9 @@ class RegistrationResult:
             moving(A(φ(x))); None for the identity. ``displacement``, ``inverse`` and ``diagnosis`` are of φ alone.
         alignment: how that map was found; None where it was given, or none was asked for.
         evaluation: what labels and landmarks say; None without them.
+        similarity_aligned: the mark after the alignment ``(B,)``, over the voxels of ``similarity_after``; None where
+            nothing was aligned.
+        choice: a sentence on the similarity that was chosen; None where it was given.
     """
 
     displacement: Tensor
@@ -84,6 +90,8 @@ class RegistrationResult:
     grid: Grid
     similarity_before: Tensor
     similarity_after: Tensor
+    objective_before: Tensor
+    objective_after: Tensor
     diagnosis: Diagnosis
     inverse_error_mean: Tensor
     inverse_error_max: Tensor
@@ -93,3 +101,5 @@ class RegistrationResult:
     affine: Affine | None = None
     alignment: Alignment | None = None
     evaluation: Evaluation | None = None
+    similarity_aligned: Tensor | None = None
+    choice: str | None = None

@@ -1,15 +1,17 @@
 """Settings of a registration, nested by subject: typed, frozen, checked when made."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from torchdeform.core.flow import OdeSolver
+from torchdeform.core.image import AUTO
 from torchdeform.errors import RANGES, InputError, require_choice, require_ranges
 from torchdeform.fem.solver import SolverSettings
 from torchdeform.metrics.similarity import similarity_weights
 from torchdeform.registration.affine.settings import AlignmentSettings
 
-STARTS = ("identity", "discrete")
+STARTS = (AUTO, "identity", "discrete")
 STENCILS = ("auto", "convolution", "shifts")
 
 
@@ -18,18 +20,19 @@ class SimilaritySettings:
     """What is compared, and how.
 
     Args:
-        measure: ``lncc`` (squared local normalised cross-correlation, for images of one contrast with different
-            brightness), ``ncc`` (the correlation of whole images), ``ssd`` (mean squared difference, for images on the
-            same intensity scale); for images of different contrast ``mi`` and ``nmi`` (mutual information, normalised),
-            ``ngf`` (directions of the gradients), ``mind`` (self-similarity of patches). Or several of them with
-            positive weights, as ``{lncc: 1, mi: 0.5}``.
+        measure: ``auto`` looks at the images and takes ``lncc`` where they have one contrast and ``mind`` where they do
+            not (``lncc`` in layers). For images of one contrast: ``lncc`` (squared local normalised cross-correlation,
+            whatever the brightness), ``ncc`` (the correlation of whole images), ``ssd`` (mean squared difference, for
+            images on the same intensity scale). For images of different contrast: ``mind`` (self-similarity of
+            patches), ``mi`` and ``nmi`` (mutual information, normalised), ``ngf`` (directions of the gradients). Or
+            several of them with positive weights, as ``{lncc: 1, mi: 0.5}``.
         window: width of the LNCC window in voxels, odd.
 
     Raises:
         InputError: a value out of range, named.
     """
 
-    measure: str | Mapping[str, float] = "lncc"
+    measure: str | Mapping[str, float] = AUTO
     window: int = 9
 
     def __post_init__(self) -> None:
@@ -195,8 +198,8 @@ class RegistrationSettings:
     Args:
         align: how images (not tensors) are aligned first; as one value its ``kind``: ``none``, ``translation``,
             ``rigid``, ``similarity`` or ``affine``.
-        start: map to begin with: ``identity``, or ``discrete`` for one from a search over large displacements, see
-            `discrete_start`.
+        start: map to begin with: ``identity``, ``discrete`` for one from a search over large displacements, see
+            `discrete_start`, or ``auto``: discrete where ``mind`` is compared.
         discrete: settings of that search.
         similarity: what is compared; as one value its ``measure``.
         metric: what a velocity costs.
@@ -210,13 +213,15 @@ class RegistrationSettings:
         points_weight: what landmarks weigh against the similarity: the mean of |φ(p) − q|² over the pairs, in squared
             units of spacing (mm² for images), is multiplied by this and taken off; 0 only measures them.
         symmetric: prefer neither image: both are warped into a space between, so that swapping them inverts the map.
+        outside: value of ``warped`` where an image (not a tensor) does not reach: a number, or ``auto`` for what
+            surrounds it, the grey value of its border if that is nearly constant, else its minimum.
 
     Raises:
         InputError: a value out of range, named.
     """
 
     align: AlignmentSettings = _ALIGN
-    start: str = "identity"
+    start: str = AUTO
     discrete: DiscreteSettings = _DISCRETE
     similarity: SimilaritySettings = _SIMILARITY
     metric: MetricSettings = _METRIC
@@ -227,6 +232,7 @@ class RegistrationSettings:
     stencil: str = "auto"
     points_weight: float = 0.0
     symmetric: bool = False
+    outside: float | str = AUTO
 
     def __post_init__(self) -> None:
         for name, key in SHORT_FORMS.items():
@@ -235,4 +241,18 @@ class RegistrationSettings:
                 object.__setattr__(self, name, replace(_SHORT_DEFAULTS[name], **{key: value}))
         require_choice(self.start, STARTS, "start")
         require_choice(self.stencil, STENCILS, "stencil")
+        if isinstance(self.outside, str):
+            require_choice(self.outside, (AUTO,), "outside, if it is no number,")
+        else:
+            require_ranges(self, "", outside=(math.isfinite, "be finite"))
         require_ranges(self, "", points_weight="finite, not negative")
+
+    @property
+    def starts_discretely(self) -> bool:
+        """Whether the map to begin with is searched for."""
+        return self.start == "discrete" or (self.start == AUTO and self.similarity.measure == "mind")
+
+    def with_similarity(self, measure: str | Mapping[str, float]) -> "RegistrationSettings":
+        """Return the same with this measure, and the start that goes with it in place of ``auto``."""
+        chosen = replace(self, similarity=replace(self.similarity, measure=measure))
+        return replace(chosen, start="discrete" if chosen.starts_discretely else "identity")

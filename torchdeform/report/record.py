@@ -29,9 +29,11 @@ def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[st
         moving: the moving image as read.
 
     Returns:
-        A mapping for `write_json`; sizes are in x, y, z order as in ITK, errors in voxels.
+        A mapping for `write_json`; sizes are in x, y, z order as in ITK, inverse errors in voxels. Spacings, origins
+        and distances of labels and landmarks are in ``unit``, that of the fixed image; the moving image has its own.
     """
     return {
+        "unit": fixed.unit,
         "fixed": _place(fixed),
         "moving": _place(moving),
         "similarity": result.settings.similarity.measure,
@@ -43,7 +45,7 @@ def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[st
         "inverse_error_max": result.inverse_error_max.item(),
         "seconds": result.seconds,
         "alignment": _alignment(result),
-        "evaluation": _evaluation(result.evaluation),
+        "evaluation": _evaluation(result.evaluation, fixed),
         "label_interpolation": result.evaluation and result.evaluation.label_interpolation,
         "levels": [_level(level) for level in result.levels],
         "device": device_name(result.displacement.device),
@@ -65,8 +67,9 @@ def _place(image: Image) -> dict[str, object]:
     return {
         "path": image.name,
         "size": image.grid.shape[::-1],
-        "spacing": image.grid.spacing[::-1],
-        "origin": image.origin,
+        "unit": image.unit,
+        "spacing": [image.in_unit(length) for length in image.grid.spacing[::-1]],
+        "origin": [image.in_unit(length) for length in image.origin],
         "channels": image.data.shape[1],
         "pixel_type": image.pixel_type,
     }
@@ -87,24 +90,24 @@ def _alignment(result: RegistrationResult) -> dict[str, object]:
     }
 
 
-def _evaluation(evaluation: Evaluation | None) -> dict[str, object]:
+def _evaluation(evaluation: Evaluation | None, fixed: Image) -> dict[str, object]:
     """Return overlap and distances before, after the alignment and at the end."""
     if evaluation is None:
         return {}
     stages = {"before": evaluation.before, "aligned": evaluation.aligned, "after": evaluation.after}
-    return {name: _measures(measures) for name, measures in stages.items() if measures is not None}
+    return {name: _measures(measures, fixed) for name, measures in stages.items() if measures is not None}
 
 
-def _measures(measures: Measures) -> dict[str, object]:
-    """Return the figures of one stage; distances in mm."""
+def _measures(measures: Measures, fixed: Image) -> dict[str, object]:
+    """Return the figures of one stage; distances in the unit of the fixed image."""
     found: dict[str, object] = {}
     if measures.labels:
         names = [str(label) for label in measures.labels]
         found["dice_mean"] = measures.dice[0].nanmean().item()
         found["dice"] = dict(zip(names, measures.dice[0].tolist(), strict=True))
-        found["hausdorff_95"] = dict(zip(names, measures.hausdorff[0].tolist(), strict=True))
+        found["hausdorff_95"] = dict(zip(names, fixed.in_unit(measures.hausdorff[0]).tolist(), strict=True))
     if measures.distances is not None:
-        errors = measures.distances[0]
+        errors = fixed.in_unit(measures.distances[0])
         found["landmark_error_mean"] = errors.mean().item()
         found["landmark_error_median"] = errors.median().item()
         found["landmark_error_max"] = errors.max().item()

@@ -84,7 +84,7 @@ def _accuracy(record: Record) -> list[Tile]:
     found = []
     for key, name, unit, about in (
         ("dice_mean", "Dice of the labels", "", "mean overlap before → after; 1 is perfect"),
-        ("landmark_error_mean", "Distance of landmarks", " mm", "mean before → after; 0 is perfect"),
+        ("landmark_error_mean", "Distance of landmarks", f" {record['unit']}", "mean before → after; 0 is perfect"),
     ):
         before, after = ends(record, key)
         if math.isfinite(after):
@@ -128,8 +128,8 @@ def _labels(record: Record) -> Table | None:
     means = " → ".join(f"{number(m['dice_mean'])} {stage}" for stage, m in stages.items())
     head = ["label", *(f"Dice {stage}" for stage in stages), "distance before", "distance after"]
     summary = (
-        f"Mean Dice {means}, over {len(after)} labels; the worst come first. Distance: 95 % Hausdorff, in mm or the "
-        "unit of the files."
+        f"Mean Dice {means}, over {len(after)} labels; the worst come first. Distance: 95 % Hausdorff, in "
+        f"{record['unit']}."
     )
     return Table("Labels", [_foldable(head, rows, f"All {len(rows)} labels")], summary)
 
@@ -138,7 +138,7 @@ def _landmarks(record: Record) -> Table | None:
     stages = _measures(record, "landmark_errors")
     if not stages:
         return None
-    head = ["distance in mm", *stages]
+    head = [f"distance in {record['unit']}", *stages]
     whole = [
         [kind, *(number(m[f"landmark_error_{kind}"]) for m in stages.values())] for kind in ("mean", "median", "max")
     ]
@@ -181,7 +181,16 @@ def _images(record: Record) -> Table:
     for name in ("fixed", "moving"):
         place = record[name]
         size, spacing = ("×".join(number(v) for v in place[key]) for key in ("size", "spacing"))
-        rows.append([name, str(place["path"]), size, spacing, f"{place['channels']}", str(place["pixel_type"])])
+        rows.append(
+            [
+                name,
+                str(place["path"]),
+                size,
+                f"{spacing} {place['unit']}",
+                f"{place['channels']}",
+                str(place["pixel_type"]),
+            ]
+        )
     inputs = [
         [option.replace("_", " "), path, "", "", "", ""]
         for option, path in record.get("inputs", {}).items()

@@ -80,7 +80,7 @@ def _labels(record: Record) -> list[Finding]:
 
 def _landmarks(record: Record) -> list[Finding]:
     before, after = ends(record, "landmark_error_mean")
-    figures = f"(mean distance {number(before)} → {number(after)} mm)"
+    figures = f"(mean distance {number(before)} → {number(after)} {record['unit']})"
     words = ("farther apart than", "no nearer than", "nearer than")
     return _graded(before - after, _STEADY * before, *(f"The landmarks are {word} before {figures}." for word in words))
 

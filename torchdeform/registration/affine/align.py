@@ -134,8 +134,9 @@ def _optimise_levels(
     for index, objective in enumerate(objectives):
         if index == 1 or not candidates:
             candidates = [*candidates, identity]
-        if index >= _LEVELS_OF_SEVERAL:
-            candidates = candidates[:1]  # the most similar on the level before
+        if index >= _LEVELS_OF_SEVERAL:  # only one goes on, which details decide
+            values, _ = objective.values(torch.stack([candidate.map for candidate in candidates]))
+            candidates = [candidates[int(values.argmax())]]
         shortest = _SHORTEST_AT_LAST if objective is objectives[-1] else _SHORTEST
         found = optimised(objective, candidates, moves, settings.steps, shortest)
         candidates = [candidate for candidate in found if candidate.value > -math.inf]

@@ -1,0 +1,155 @@
+"""Where a deformation begins: the alignment, kept only where it helps, and the similarity that suits both images."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchdeform.core.grid import Grid
+from torchdeform.core.image import AUTO, Image, overlap
+from torchdeform.core.resampling import box_sum, with_spacing
+from torchdeform.core.stages import begin
+from torchdeform.core.transform import Affine
+from torchdeform.metrics.correlation import LNCC_FLOOR, contrast, local_contrast
+from torchdeform.metrics.similarity import mark
+from torchdeform.registration.affine.align import Alignment, align
+from torchdeform.registration.problem import Annotations, PlacedImage, RegistrationProblem, placed_images, resample_pair
+from torchdeform.registration.settings import RegistrationSettings
+
+# An alignment is taken where it raises the merit by more than this.
+_GAIN = 1e-4
+
+# Local correlations are compared on at most so many nodes to the power of D, in windows of so many, which count half
+# where their standard deviation is a grey level of 3 %; voxels grow by a factor until the nodes are few enough.
+_NODES, _WINDOW, _CLEAR, _COARSER = 128, 9, 0.03, 1.05
+
+# Share of one sign in the local correlations from which on both images have one contrast. On the pairs of one contrast
+# in docs/accuracy.md it is 0.92 and more, in two contrasts 0.09 to 0.45 (spine T1 and T2, brain maps painted as both).
+_ONE_CONTRAST = 0.65
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How a registration begins.
+
+    Attributes:
+        settings: the settings, with a similarity and a start in place of ``auto``.
+        affine: map of the world from the fixed to the moving image; None for the identity.
+        alignment: how it was found; None where it was given, or none was asked for.
+        unaligned: `mark` of both images where the files place them ``(1,)``; None where they do not overlap, or where
+            nothing was aligned.
+        choice: a sentence on the similarity that was chosen; None where it was given.
+    """
+
+    settings: RegistrationSettings
+    affine: Affine | None = None
+    alignment: Alignment | None = None
+    unaligned: Tensor | None = None
+    choice: str | None = None
+
+
+@torch.no_grad()
+def place(
+    fixed: Image, moving: Image, settings: RegistrationSettings, annotations: Annotations, affine: Affine | None = None
+) -> Placement:
+    """Return where the deformation of two images begins, and how they are compared.
+
+    Args:
+        fixed: image that stays.
+        moving: image that is warped.
+        settings: what is asked for.
+        annotations: masks.
+        affine: map of the world that is known already; None to align as the settings say.
+
+    Notes:
+        The alignment is not taken where the files' own place has as much merit: `mark` times the share of the fixed
+        image's contrast that is seen, at full detail, in the measure of the registration. Merit counts what the moving
+        image does not show as unrelated, so that both places are judged over the same voxels.
+    """
+    both, alignment = placed_images(fixed, moving, annotations), None
+    if affine is None and settings.align.kind != "none":
+        alignment = _align(fixed, moving, settings, annotations)
+        affine = alignment.affine
+    problem = problem_at(*both, affine)
+    settings, choice = choose(problem, settings)
+    if alignment is None:
+        return Placement(settings, affine, choice=choice)
+    unaligned, merit = _marked(problem_at(*both, None), settings) if overlap(fixed, moving) > 0 else (None, None)
+    if merit is not None and not bool(_marked(problem, settings)[1] > merit + _GAIN):
+        kept = replace(alignment, affine=Affine.identity(fixed.grid.dim), start="geometry")
+        alignment = replace(kept, similarity_after=alignment.similarity_before)
+    return Placement(settings, alignment.affine, alignment, unaligned, choice)
+
+
+def _align(fixed: Image, moving: Image, settings: RegistrationSettings, annotations: Annotations) -> Alignment:
+    """Align as the settings say, with masks."""
+    begin("aligning")
+    masks = (annotations.fixed_mask, annotations.moving_mask)
+    first, second = (mask if isinstance(mask, Image) else None for mask in masks)
+    return align(fixed, moving, fixed_mask=first, moving_mask=second, settings=settings.align)
+
+
+def problem_at(fixed: PlacedImage, moving: PlacedImage, affine: Affine | None) -> RegistrationProblem:
+    """Return the problem on the fixed grid, the moving image being where an affine map of the world finds it."""
+    return resample_pair(fixed, moving if affine is None else moving.moved(affine.inverse()), fixed.image)
+
+
+def _marked(problem: RegistrationProblem, settings: RegistrationSettings) -> tuple[Tensor, Tensor]:
+    """Return mark and merit of two images, each ``(B,)``, 0 where they have no voxel in common."""
+    mask = problem.mask
+    if mask is not None and not bool((mask > 0).flatten(1).any(1).all()):
+        return (nothing := problem.fixed.new_zeros(len(problem.fixed))), nothing
+    scaled, chosen = problem.scaled(settings), settings.similarity
+    found = mark(chosen.measure, scaled.fixed, scaled.moving, mask=mask, window=chosen.window, grid=problem.grid)
+    contrast = local_contrast(scaled.fixed, chosen.window)
+    counted = contrast if problem.fixed_mask is None else contrast * problem.fixed_mask
+    seen = contrast if mask is None else contrast * mask
+    return found, found * (seen.flatten(1).sum(1) / counted.flatten(1).sum(1))
+
+
+def choose(problem: RegistrationProblem, settings: RegistrationSettings) -> tuple[RegistrationSettings, str | None]:
+    """Return the settings with a similarity in place of ``auto``, and a sentence on the choice; None without one.
+
+    Args:
+        problem: the images in the place where the deformation begins, in their own units.
+        settings: what is asked for.
+
+    Notes:
+        ``lncc`` where one intensity is locally a linear function of the other, which shows in local correlations of one
+        sign, and ``mind`` with a discrete start where they change their sign from place to place.
+    """
+    if settings.similarity.measure != AUTO:
+        return settings.with_similarity(settings.similarity.measure), None
+    agreement = sign_agreement(problem.scaled(settings))
+    measure = "lncc" if agreement >= _ONE_CONTRAST else "mind"
+    kind = "one contrast" if measure == "lncc" else "different contrasts"
+    sentence = f"similarity {measure}: the images have {kind} (local correlations of one sign: {agreement:.0%})"
+    return settings.with_similarity(measure), sentence
+
+
+def sign_agreement(problem: RegistrationProblem) -> float:
+    """Return |Σ t r| / Σ t |r|, r being the correlations in windows and t their contrast in both: 1 for one sign.
+
+    Args:
+        problem: images scaled to about [0, 1]; a batch is taken as one.
+    """
+    problem = problem.on(_coarse(problem.grid))
+    images = problem.fixed, problem.moving
+    count = box_sum(torch.ones_like(problem.fixed[:1, :1]), _WINDOW)
+    means = [box_sum(image, _WINDOW) / count for image in images]
+    spread = [(box_sum(x * x, _WINDOW) / count - m * m).clamp(min=0) for x, m in zip(images, means, strict=True)]
+    covariance = box_sum(images[0] * images[1], _WINDOW) / count - means[0] * means[1]
+    r = covariance / ((spread[0] + LNCC_FLOOR) * (spread[1] + LNCC_FLOOR)).sqrt()
+    weight = contrast(spread[0], _CLEAR) * contrast(spread[1], _CLEAR)
+    weight = weight if problem.mask is None else weight * problem.mask
+    return float((weight * r).sum().abs() / (weight * r.abs()).sum().clamp(min=torch.finfo(r.dtype).tiny))
+
+
+def _coarse(grid: Grid) -> Grid:
+    """Return the finest grid of the same box, or the grid itself, with few enough nodes."""
+    size, coarse = min(grid.spacing), grid
+    while math.prod(coarse.shape) > _NODES**grid.dim:
+        size *= _COARSER
+        coarse = with_spacing(grid, size)
+    return coarse
