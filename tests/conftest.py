@@ -15,6 +15,7 @@ from torchdeform.core.diagnostics import diagnose
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, resample
 from torchdeform.core.warp import invert
+from torchdeform.registration.evidence import Evidence
 from torchdeform.registration.problem import Annotations
 from torchdeform.registration.result import Callback, LevelRecord, Progress, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
@@ -135,7 +136,31 @@ def known_result(
         levels=tuple(LevelRecord(shape, similarity, 0, 0.5) for shape in shapes),
         seconds={"optimise": 1.0},
         settings=config or RegistrationSettings(),
+        evidence=(_FINE,),
     )
+
+
+_FINE = Evidence(
+    correlation_before=0.5,
+    correlation=0.9,
+    information_before=0.4,
+    information=0.7,
+    edges_before=2.0,
+    edges=0.5,
+    foreground_before=0.8,
+    foreground=0.95,
+    disagreement=0.02,
+    extreme=0.01,
+    extreme_inside=0.01,
+    inverse_error=0.001,
+    covered=1.0,
+)
+
+
+@pytest.fixture
+def fine_evidence() -> Evidence:
+    """Return the evidence of an ordinary registration that went well."""
+    return _FINE
 
 
 def _blobs(world: Tensor, phase: int) -> Tensor:

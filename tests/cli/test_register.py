@@ -59,7 +59,8 @@ def test_pictures_end_to_end(folder, engine, capsys):
     assert main(["fixed.png", "moving.png", "--out", "results/one"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
-    assert 3 <= len(out.splitlines()) <= 6
+    assert 3 <= len(out.splitlines()) <= 7
+    assert out.startswith("✓ The images fit")
     for word in ("similarity", "folds", "determinant", "inverse consistency", "seconds", "results/one"):
         assert word in out
     assert _names(folder / "results" / "one") == sorted([*RESULTS, "warped.png"])

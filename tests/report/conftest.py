@@ -45,13 +45,13 @@ def make_full(make_image, make_result) -> Callable[..., tuple[ReportData, dict[s
             affine=shift,
             alignment=Alignment(shift, 0.1, 0.2, "centres", 0.5, ()),
             evaluation=_evaluation(labels, landmarks),
+            warnings=(f"this is odd: {NASTY}",),
         )
         object.__setattr__(result, "absent", _corner(fixed).data)
         record = describe(result, fixed, moving)
         inputs = {"fixed": fixed.name, "moving": moving.name, "out": "my results"}
         record |= {
             "inputs": inputs,
-            "warnings": (f"this is odd: {NASTY}",),
             "seconds": {"read": 0.1, **result.seconds},
             "memory": {"read": 10**8, "optimise": 2 * 10**9},
             "command": repeat_command(inputs, settings, "cpu", 10**9),

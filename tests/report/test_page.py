@@ -132,7 +132,7 @@ def test_figures_that_are_missing_are_dashes(tmp_path, make_full):
     record["evaluation"]["after"]["dice"]["2"] = math.nan
     record["evaluation"]["after"]["hausdorff_95"]["2"] = None
     _, page = _page(tmp_path, report_data, record)
-    assert "not a number" in page.text
+    assert "0.1 → –" in page.text
 
 
 def test_long_tables_are_folded(tmp_path, make_full):

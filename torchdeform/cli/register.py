@@ -1,6 +1,8 @@
 """``register``: one pair of images, from two files to a folder of results."""
 
 import os
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,6 +32,11 @@ from torchdeform.pipeline.config import load_settings, parse_override, preset_na
 from torchdeform.pipeline.memory import parse_size
 from torchdeform.pipeline.register import REPORT, REPORTS, Outcome, PairFiles, register_files
 from torchdeform.registration.affine.settings import ALIGNMENTS
+from torchdeform.registration.verdict import BAD, GOOD, LOOK, MARKS, WARNED
+
+_BAD_RESULT = 3  # exit code
+_PLAIN_MARKS = {GOOD: "OK", LOOK: "!", BAD: "X"}  # for terminals without Unicode
+_COLOURS = {GOOD: typer.colors.GREEN, LOOK: typer.colors.YELLOW, BAD: typer.colors.RED}
 
 Report = Annotated[str, choice(REPORTS, "Pictures: {}; light has the middle slices only.", "KIND")]
 Overwrite = Annotated[bool, flag("--overwrite", "Replace results of another pair in the folder.")]
@@ -54,6 +61,7 @@ Preset = Annotated[str, choice(preset_names(), "Settings to start from: {}.", sh
 Config = Annotated[
     Path | None, typer.Option(metavar="FILE", help="YAML file with settings that differ from the preset.")
 ]
+Strict = Annotated[bool, flag("--strict", "End with exit code 3 if the verdict is bad.")]
 Assignments = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting that differs; can be repeated.")
 ]
@@ -76,6 +84,7 @@ def register(
     config: Config = None,
     assignments: Assignments = None,
     memory: Memory = None,
+    strict: Strict = False,
     device: Device = "auto",
     report: Report = "full",
     overwrite: Overwrite = False,
@@ -114,11 +123,13 @@ def register(
     elif not quiet:
         for warning in outcome.record["warnings"]:
             warn(warning)
-        typer.echo(summary(outcome))
+        typer.echo(summary(outcome), color=False if os.environ.get("NO_COLOR") else None)
+    if strict and outcome.record["verdict"]["kind"] == BAD:
+        raise typer.Exit(_BAD_RESULT)
 
 
 def summary(outcome: Outcome) -> str:
-    """Return the most important figures of a registration in a few lines."""
+    """Return the verdict and the most important figures of a registration in a few lines."""
     r = outcome.record
     lines = {
         f"similarity ({measure_name(r['similarity'])})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
@@ -130,7 +141,27 @@ def summary(outcome: Outcome) -> str:
     }
     if REPORT in r["files"]:
         lines["look at"] = str(outcome.folder / REPORT)
-    return table(lines)
+    return f"{verdict_text(r['verdict'])}\n{table(lines)}"
+
+
+def verdict_text(verdict: Mapping[str, Any]) -> str:
+    """Return the headline of a verdict with its sign, in colour, and the reasons below it that are no warnings."""
+    kind = verdict["kind"]
+    sign = MARKS[kind] if _can_print(MARKS[kind]) else _PLAIN_MARKS[kind]
+    reasons = [
+        f"  {finding['text']}"
+        for finding in verdict["findings"]
+        if finding["kind"] != GOOD and not finding["text"].startswith(WARNED)
+    ]
+    return "\n".join([typer.style(f"{sign} {verdict['headline']}", fg=_COLOURS[kind], bold=True), *reasons])
+
+
+def _can_print(text: str) -> bool:
+    try:
+        text.encode(sys.stdout.encoding or "ascii")
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _measured(record: dict[str, Any]) -> dict[str, str]:

@@ -20,6 +20,8 @@ DONE, FAILED = "done", "failed"
 
 # Figures of a pair in the summary, most of them with their names in the pair's record.
 FIGURES = (
+    "verdict",
+    "headline",
     "similarity_before",
     "similarity_after",
     "dice_before",
@@ -55,7 +57,7 @@ class PairReport:
         seconds: wall time of the registration, with reading and writing files.
         peak_memory: peak memory of the process in bytes, 0 if unknown.
         gpu_memory: peak memory on the GPU in bytes.
-        figures: numbers for the summary by column, without those that were not measured.
+        figures: entries of the summary by column, without those that were not measured.
         files: names of the results in the pair's folder.
     """
 
@@ -64,7 +66,7 @@ class PairReport:
     seconds: float = 0.0
     peak_memory: int = 0
     gpu_memory: int = 0
-    figures: Mapping[str, float] = field(default_factory=dict)
+    figures: Mapping[str, float | str] = field(default_factory=dict)
     files: tuple[str, ...] = ()
 
 
@@ -100,13 +102,14 @@ def _sentence(error: Exception) -> str:
     return explain(error)[0]
 
 
-def _figures(record: dict[str, Any]) -> dict[str, float]:
+def _figures(record: dict[str, Any]) -> dict[str, float | str]:
+    verdict = {"verdict": record["verdict"]["kind"], "headline": record["verdict"]["headline"]}
     measured = {
         f"{column}_{stage}": record["evaluation"].get(stage, {}).get(key)
         for column, key in _MEASURED.items()
         for stage in ("before", "after")
     }
-    return {name: value for name in FIGURES if (value := (record | measured)[name]) is not None}
+    return {name: value for name in FIGURES if (value := (record | measured | verdict)[name]) is not None}
 
 
 def _log_job(job: Job) -> None:

@@ -209,8 +209,8 @@ def register_files(
         result = resample_result(result, inputs.fixed.to(where), moving, annotations)
     _require_finite(result)
     run.peaks[next(reversed(result.seconds), "register")] = peak()
-    found = result.alignment.warnings if result.alignment else ()
-    return _write_results(files, replace(inputs, warnings=(*inputs.warnings, *notes, *found)), result, run, report)
+    result = replace(result, warnings=(*inputs.warnings, *notes, *result.warnings))
+    return _write_results(files, inputs, result, run, report)
 
 
 @dataclass(frozen=True)
@@ -289,7 +289,6 @@ def _record(files: PairFiles, inputs: Inputs, result: RegistrationResult, run: _
     device = result.displacement.device.type
     return describe(result, inputs.fixed, inputs.moving) | {
         "inputs": given,
-        "warnings": inputs.warnings,
         "seconds": run.seconds,
         "memory": run.peaks,
         "command": repeat_command(given, result.settings, device, run.memory),

@@ -18,7 +18,9 @@ from torchdeform.core.warp import invert, warp
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.metrics.evaluation import evaluate_images, evaluate_tensors
 from torchdeform.metrics.similarity import mark
+from torchdeform.registration.agreement import disagreement
 from torchdeform.registration.discrete import discrete_start
+from torchdeform.registration.evidence import gather_evidence, to_compare, with_labels
 from torchdeform.registration.optimise import best_map, common_mask, forward_objective, optimise_levels
 from torchdeform.registration.placement import Placement, choose, place, problem_at
 from torchdeform.registration.problem import (
@@ -106,12 +108,28 @@ def _register_tensors(
     settings, choice = choose(problem, settings)
     problem = problem.scaled(settings)
     space = midspace_of_tensors(problem) if settings.symmetric else None
-    found = _optimise(problem, space, settings, start, callback)
+    found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
     del problem, space
     with limit_threads(len(found.u), grid):
         warped = warp(moving, found.u, grid)
         evaluation = evaluate_tensors(found.u, grid, labels=annotations.labels, points=annotations.points)
-    return replace(_result(found, grid, warped, settings), evaluation=evaluation, choice=choice)
+    result = replace(_result(found, grid, warped, settings), evaluation=evaluation, choice=choice)
+    return _examined(result, compared, (fixed, moving), annotations.labels)
+
+
+def _examined(
+    result: RegistrationResult,
+    compared: RegistrationProblem,
+    images: tuple[Tensor, Tensor],
+    labels: tuple[Tensor, Tensor] | None,
+) -> RegistrationResult:
+    """Return the result with its evidence, from images on a grid of few nodes, and labels on the images' own grids."""
+    began = perf_counter()
+    maps = (result.displacement, result.inverse, result.grid)
+    evidence = gather_evidence(compared, *maps, disagreement=disagreement(compared))
+    if labels is not None:
+        evidence = with_labels(evidence, images, labels)
+    return replace(result, evidence=evidence, seconds=result.seconds | {"judge": perf_counter() - began})
 
 
 def _checked_grid(fixed: Tensor, moving: Tensor, annotations: Annotations) -> Grid:
@@ -148,20 +166,25 @@ def _register_images(
     both, settings, affine = placed_images(fixed, moving, annotations), placed.settings, placed.affine
     problem = problem_at(*both, affine).scaled(settings)
     space = _midspace(*both, problem, affine, settings) if settings.symmetric else None
-    found = _optimise(problem, space, settings, start, callback)
+    found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
     del problem, space
     warped = _warped(fixed, moving, affine, found.u, settings)
     alignment, result = placed.alignment, _result(found, fixed.grid, warped, settings)
-    return replace(
+    result = replace(
         result,
         affine=affine,
         alignment=alignment,
+        warnings=alignment.warnings if alignment else (),
+        unit="mm",
         choice=placed.choice,
         similarity_before=result.similarity_before if placed.unaligned is None else placed.unaligned,
         similarity_aligned=result.similarity_before if alignment else None,
         evaluation=evaluate_images(fixed, affine, found.u, labels=annotations.labels, points=annotations.points),
         seconds=({"align": alignment.seconds} if alignment else {}) | result.seconds,
     )
+    given = annotations.labels
+    labels = given and (resample(given[0], fixed, mode="nearest"), resample(given[1], moving, mode="nearest"))
+    return _examined(result, compared, (fixed.data, moving.data), labels)
 
 
 def _midspace(

@@ -8,9 +8,12 @@ from torch import Tensor
 from torchdeform.core.diagnostics import Diagnosis
 from torchdeform.core.grid import Grid
 from torchdeform.core.transform import Affine
+from torchdeform.errors import InputError
 from torchdeform.metrics.evaluation import Evaluation
 from torchdeform.registration.affine.align import Alignment
+from torchdeform.registration.evidence import Evidence
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.verdict import Verdict, judge
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,9 @@ class RegistrationResult:
         similarity_aligned: the mark after the alignment ``(B,)``, over the voxels of ``similarity_after``; None where
             nothing was aligned.
         choice: a sentence on the similarity that was chosen; None where it was given.
+        evidence: what the images and the map say, of each item.
+        warnings: sentences about what looks wrong with the images.
+        unit: what lengths are shown in.
     """
 
     displacement: Tensor
@@ -103,3 +109,25 @@ class RegistrationResult:
     evaluation: Evaluation | None = None
     similarity_aligned: Tensor | None = None
     choice: str | None = None
+    evidence: tuple[Evidence, ...] = ()
+    warnings: tuple[str, ...] = ()
+    unit: str = "px"
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the registration of one pair went well.
+
+        Raises:
+            InputError: a batch of several pairs, whose `evidence` can be judged one by one.
+        """
+        if len(self.evidence) != 1:
+            raise InputError(f"verdict: there are {len(self.evidence)} pairs; register them one by one, or judge each")
+        return judge(
+            self.evidence[0],
+            self.grid,
+            folds=int(self.diagnosis.folds),
+            evaluation=self.evaluation,
+            mirror=self.alignment.mirror if self.alignment else 0.0,
+            warnings=self.warnings,
+            unit=self.unit,
+        )

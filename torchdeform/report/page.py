@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from torchdeform.metrics.similarity import measure_name
+from torchdeform.registration.verdict import MARKS
 from torchdeform.report.contours import Lines
 from torchdeform.report.drawing import (
     LINES,
@@ -28,7 +29,6 @@ from torchdeform.report.record import describe
 from torchdeform.report.report_data import ReportData, Slices
 from torchdeform.report.sampling import FIXED, MOVING, ORIGINAL, WARPED
 from torchdeform.report.tables import command_lines, file_name, footer, tables, tiles
-from torchdeform.report.verdict import BAD, DOUBTFUL, GOOD, judge
 from torchdeform.report.web_images import (
     UNITS,
     Bar,
@@ -43,7 +43,6 @@ from torchdeform.report.web_images import (
 )
 
 _TEMPLATES = Path(__file__).parent / "templates"
-_MARKS = {GOOD: "✓", DOUBTFUL: "!", BAD: "✗"}
 _MODES = {"swipe": "swipe", "flicker": "flicker", "checkerboard": "checkerboard", "overlay": "two colours"}
 # Largest side of a slice in pixels and quality of its JPEG, from the best to one that always fits.
 _SIZES = {2: ((900, 88), (700, 80), (500, 70), (350, 50)), 3: ((256, 85), (224, 75), (192, 60), (144, 40))}
@@ -66,8 +65,8 @@ def write_report(path: Path, data: ReportData, record: Mapping[str, Any] | None 
     """
     known = describe(data.result, data.fixed, data.moving) if record is None else record
     page = _render(
-        verdict=judge(known),
-        marks=_MARKS,
+        verdict=known["verdict"],
+        marks=MARKS,
         modes=_MODES,
         fixed_name=file_name(known["fixed"]),
         moving_name=file_name(known["moving"]),

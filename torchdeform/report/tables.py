@@ -7,13 +7,25 @@ from pathlib import Path
 from typing import Any
 
 from torchdeform.metrics.similarity import measure_name
+from torchdeform.registration.verdict import number
 from torchdeform.report.record import apply_commands
-from torchdeform.report.verdict import ends, number, value
 
 _LONG = 12  # a table with more rows is folded
 _STAGES = ("before", "aligned", "after")
 
 Record = Mapping[str, Any]
+
+
+def ends(record: Record, key: str) -> tuple[float, float]:
+    """Return a measure of labels or landmarks at the start and at the end; NaN if unknown."""
+    measures = record.get("evaluation", {})
+    before, after = (value(measures.get(stage, {}).get(key)) for stage in ("before", "after"))
+    return before, after
+
+
+def value(figure: float | None) -> float:
+    """Return a figure of a record, NaN if it is missing."""
+    return math.nan if figure is None else figure
 
 
 @dataclass(frozen=True)

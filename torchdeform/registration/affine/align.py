@@ -53,6 +53,7 @@ class Alignment:
         start: name of the start from which it was found.
         seconds: wall time.
         warnings: sentences about what looks wrong.
+        mirror: merit of the best mirrored map over that of the best map, on the coarsest level; 0 if none was tried.
     """
 
     affine: Affine
@@ -61,6 +62,7 @@ class Alignment:
     start: str
     seconds: float
     warnings: tuple[str, ...] = ()
+    mirror: float = 0.0
 
 
 @torch.no_grad()
@@ -122,6 +124,7 @@ def align(
         best.name,
         perf_counter() - began,
         _warnings(objectives[-1], best, found, (fixed.name, moving.name)),
+        found.mirror,
     )
 
 

@@ -1,0 +1,127 @@
+"""The verdict: good only where nothing speaks against it, and the reasons are named with their numbers."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchdeform.core.grid import Grid
+from torchdeform.errors import InputError
+from torchdeform.metrics.evaluation import Evaluation, Measures
+from torchdeform.registration.verdict import BAD, GOOD, LOOK, judge, number
+
+GRID = Grid((40, 50))
+NONE = torch.empty(1, 0, dtype=torch.float64)
+
+
+def labels(*stages: tuple[list[float], float]) -> Evaluation:
+    """Return the measures of stages (before, aligned, after or before, after): Dice of each label, distance of all."""
+    names = tuple(range(1, 1 + len(stages[0][0])))
+    found = [Measures(names, torch.tensor([dice]), torch.full((1, len(dice)), far)) for dice, far in stages]
+    return Evaluation(found[0], found[1] if len(found) > 2 else None, found[-1], "label")
+
+
+def landmarks(before: list[float], after: list[float]) -> Evaluation:
+    ends = (Measures((), NONE, NONE, torch.tensor([distances])) for distances in (before, after))
+    return Evaluation(next(ends), None, next(ends))
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "words"),
+    [
+        ({}, GOOD, "The images fit (correlation 0.5 → 0.9"),
+        ({"correlation_before": 1.0, "correlation": 1.0, "information_before": 1.0, "information": 1.0}, GOOD, "fit"),
+        ({"information": 0.35}, LOOK, "little in common (0.35 of"),
+        ({"information": math.nan}, LOOK, "little in common (– of"),
+        ({"information": 0.1}, BAD, "do not fit"),
+        ({"correlation": 0.6}, LOOK, "hardly correlates (0.6;"),
+        ({"disagreement": 0.3}, LOOK, "another one is found for 30%"),
+        ({"extreme_inside": 0.2, "extreme": 0.1}, LOOK, "20% of what has contrast, 10% of all voxels"),
+        ({"disagreement": 0.3, "extreme_inside": 0.2, "correlation": 0.6}, BAD, "do not fit"),
+        ({"information_before": 0.8}, LOOK, "less alike (information 0.8 → 0.7)"),
+        ({"information_before": 0.95}, BAD, "less alike (information 0.95 → 0.7)"),
+        ({"covered": 0.5}, LOOK, "covers only a part of the fixed one (50%"),
+        ({"absent": 0.2}, LOOK, "(20% of what has contrast, where"),
+        ({"inverse_error": 0.7}, LOOK, "0.7 voxels off"),
+        ({"inverse_error": math.nan}, LOOK, "– voxels off"),
+        ({"turned": ("x", "y")}, BAD, "turned over along x and y"),
+    ],
+)
+def test_the_images_and_the_map_are_judged(fine_evidence, change, kind, words):
+    verdict = judge(replace(fine_evidence, **change), GRID, folds=0)
+    assert verdict.kind == kind
+    assert any(words in finding.text for finding in verdict.findings)
+    order = [(BAD, LOOK, GOOD).index(finding.kind) for finding in verdict.findings]
+    assert order == sorted(order)
+
+
+@pytest.mark.parametrize(
+    ("evaluation", "kind", "words"),
+    [
+        (labels(([0.5], 4.0), ([0.7], 3.0)), GOOD, "better than before (mean Dice 0.5 → 0.7; 1 of 1 better, 0 worse)"),
+        (labels(([0.5], 4.0), ([0.505], 4.0)), GOOD, "no better than before"),
+        (labels(([0.5], 4.0), ([0.4], 3.0)), BAD, "overlap less than before (mean Dice 0.5 → 0.4)"),
+        (labels(([0.0], 9.0), ([0.02], 9.0)), BAD, "do not overlap"),
+        (labels(([0.5], 4.0), ([math.nan], math.inf)), GOOD, "images fit"),
+        (labels(([0.5, 0.6], 4.0), ([0.9, 0.5], 3.0)), LOOK, "1 worse, most of all label 2: 0.6 → 0.5"),
+        (labels(([0.5, 0.6, 0.6], 4.0), ([0.9, 0.5, 0.7], 3.0)), GOOD, "2 of 3 better, 1 worse"),
+        (labels(([0.5], 4.0), ([0.7], 6.0)), LOOK, "(95 % Hausdorff distance 4 → 6 µm"),
+        (labels(([0.75], 2.0), ([0.7], 4.0), ([0.76], 2.0)), LOOK, "alignment lowered the overlap of the labels"),
+        (labels(([0.75], 2.0), ([0.7], 4.0), ([0.9], 2.0)), GOOD, "better"),
+        (landmarks([2.0, 2.0, 2.0], [1.0, 0.5, 0.5]), GOOD, "mean distance 2 → 0.667 µm; 0 of 3 farther apart"),
+        (landmarks([1.0], [1.0]), GOOD, "no nearer"),
+        (landmarks([1.0], [2.0]), BAD, "farther apart than before"),
+        (landmarks([30.0], [20.0]), BAD, "far apart (mean distance 30 → 20 µm): are they the same points?"),
+        (landmarks([3.0, 0.0], [0.1, 1.5]), LOOK, "1 of 2 farther apart"),
+    ],
+)
+def test_labels_and_landmarks_are_judged_one_by_one(fine_evidence, evaluation, kind, words):
+    verdict = judge(fine_evidence, GRID, folds=0, evaluation=evaluation, unit="µm")
+    assert verdict.kind == kind
+    assert any(words in finding.text for finding in verdict.findings)
+
+
+def test_folds_are_bad_and_counted(fine_evidence):
+    verdict = judge(fine_evidence, GRID, folds=2345)
+    assert (verdict.kind, verdict.headline) == (BAD, "Do not use this: the map folds.")
+    assert verdict.findings[0].figures == {"folds": 2345}
+    assert "2,345 voxels" in verdict.findings[0].text
+
+
+def test_the_headline_has_the_main_reason(fine_evidence):
+    verdict = judge(replace(fine_evidence, covered=0.5), GRID, folds=0)
+    assert verdict.headline == "Look closely before you use this: the moving image covers only a part of the fixed one."
+
+
+def test_a_warning_is_a_reason_to_look(fine_evidence):
+    verdict = judge(fine_evidence, GRID, folds=0, warnings=("a.png is odd; see to it",))
+    assert (verdict.kind, verdict.headline) == (LOOK, "Look closely before you use this: a.png is odd; see to it.")
+
+
+def test_a_mirror_image_is_bad_where_the_images_do_not_fit_either(fine_evidence):
+    assert judge(fine_evidence, GRID, folds=0, mirror=1.5).kind == LOOK
+    assert judge(replace(fine_evidence, disagreement=0.3), GRID, folds=0, mirror=1.5).kind == BAD
+    assert judge(fine_evidence, GRID, folds=0, mirror=1.1).kind == GOOD
+
+
+def test_labels_that_fit_outweigh_images_that_cannot_be_compared(fine_evidence):
+    unlike = replace(fine_evidence, information=0.05, correlation=0.2, information_before=0.05, correlation_before=0.2)
+    better, same = (labels(([0.7], 4.0), ([end], 4.0)) for end in (0.85, 0.705))
+    assert judge(unlike, GRID, folds=0).kind == BAD
+    assert judge(unlike, GRID, folds=0, evaluation=better).kind == LOOK
+    assert judge(unlike, GRID, folds=0, evaluation=same).kind == BAD
+    assert judge(unlike, GRID, folds=1, evaluation=better).kind == BAD
+
+
+def test_a_result_of_one_pair_has_a_verdict(make_image, make_result):
+    image = make_image((20, 24))
+    result = make_result(image, image)
+    assert result.verdict.kind == GOOD
+    assert replace(result, warnings=("odd",)).verdict.kind == LOOK
+    with pytest.raises(InputError, match="2 pairs"):
+        _ = replace(result, evidence=result.evidence * 2).verdict
+
+
+def test_numbers_are_short():
+    assert [number(v) for v in (0.12345, 12345.6, 0.0, None, math.inf)] == ["0.123", "12346", "0", "–", "–"]
