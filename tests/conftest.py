@@ -130,6 +130,8 @@ def known_result(
         grid=grid,
         similarity_before=torch.tensor([0.1]),
         similarity_after=torch.tensor([0.9]),
+        objective_before=torch.tensor([0.1]),
+        objective_after=torch.tensor([0.9]),
         diagnosis=diagnose(u, grid),
         inverse_error_mean=torch.tensor([0.01]),
         inverse_error_max=torch.tensor([0.2]),
