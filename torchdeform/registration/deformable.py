@@ -126,7 +126,8 @@ def _examined(
     """Return the result with its evidence, from images on a grid of few nodes, and labels on the images' own grids."""
     began = perf_counter()
     maps = (result.displacement, result.inverse, result.grid)
-    evidence = gather_evidence(compared, *maps, disagreement=disagreement(compared))
+    absent = getattr(result, "absent", None)
+    evidence = gather_evidence(compared, *maps, disagreement=disagreement(compared), absent=absent)
     if labels is not None:
         evidence = with_labels(evidence, images, labels)
     return replace(result, evidence=evidence, seconds=result.seconds | {"judge": perf_counter() - began})
