@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 from verdict_cases import GOOD_PAIR, KINDS, Case, Cases
 
@@ -31,7 +32,7 @@ def verdict_on(case: Case) -> td.Verdict:
     scene = case.make()
     settings = td.load_settings("default", None, scene.overrides)
     known = scene.annotations
-    masks = {"fixed_mask": known.fixed_mask, "moving_mask": known.moving_mask}
+    masks: dict[str, Any] = {"fixed_mask": known.fixed_mask, "moving_mask": known.moving_mask}
     report = preflight(scene.fixed, scene.moving, aligned=settings.align.kind != "none", settings=settings, **masks)
     for refused in report.of(ERROR):
         return td.Verdict(BAD, refused, ())

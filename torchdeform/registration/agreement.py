@@ -1,6 +1,7 @@
 """Whether two images are registered alike in both directions, each found without the other."""
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -27,11 +28,12 @@ _SETTINGS = RegistrationSettings(
 
 
 @torch.no_grad()
-def disagreement(problem: RegistrationProblem) -> Tensor:
+def disagreement(problem: RegistrationProblem, settings: RegistrationSettings) -> Tensor:
     """Return the share of what has contrast where rough maps there and back miss each other by more than a voxel.
 
     Args:
         problem: two images of one channel, see `to_compare`.
+        settings: by which solver, flow and stencil.
 
     Returns:
         ``(B,)`` from 0 to 1.
@@ -44,21 +46,22 @@ def disagreement(problem: RegistrationProblem) -> Tensor:
     grid = Grid(rough.grid.shape)  # in voxels
     both = RegistrationProblem(grid, *_there_and_back(rough.fixed, rough.moving), *_masks(rough))
     with limit_threads(1, grid):
-        there, back = _maps(both).chunk(2)
+        quick = replace(_SETTINGS, solver=settings.solver, flow=settings.flow, stencil=settings.stencil)
+        there, back = _maps(both, quick).chunk(2)
         far = (there + warp(back, there, grid)).norm(dim=1, keepdim=True) > _AGREE
     seen = Views.of(rough).seen
     return (far * seen).flatten(1).sum(1) / seen.flatten(1).sum(1).clamp(min=1e-9)
 
 
-def _maps(problem: RegistrationProblem) -> Tensor:
+def _maps(problem: RegistrationProblem, settings: RegistrationSettings) -> Tensor:
     """Return the best displacements met in some steps of steepest ascent; they may fold."""
-    level = make_level(problem, _SETTINGS, forward_objective, 0, 1)
+    level = make_level(problem, settings, forward_objective, 0, 1)
     best = u = direction = level.zero
     top = u.new_full((len(u),), -math.inf)
     for step in range(_STEPS + 1):
         warped, value, slope = level.objective.similarity.evaluate(u)
         best, top = where_items(value > top, u, best), top.maximum(value)
-        velocity = level.metric.velocity(image_force(slope, warped, problem.grid))
+        velocity = level.metric.velocity(image_force(slope, warped, problem.grid, settings.stencil))
         direction = normalise_step(velocity, problem.grid) + _MOMENTUM * direction
         u = u + _STEP * (1 - step / _STEPS) * normalise_step(direction, problem.grid)
     return best

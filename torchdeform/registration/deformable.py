@@ -124,10 +124,11 @@ def _examined(
     labels: tuple[Tensor, Tensor] | None,
 ) -> RegistrationResult:
     """Return the result with its evidence, from images on a grid of few nodes, and labels on the images' own grids."""
+    begin("judging")
     began = perf_counter()
     maps = (result.displacement, result.inverse, result.grid)
-    absent = getattr(result, "absent", None)
-    evidence = gather_evidence(compared, *maps, disagreement=disagreement(compared), absent=absent)
+    absent, apart = getattr(result, "absent", None), disagreement(compared, result.settings)
+    evidence = gather_evidence(compared, *maps, disagreement=apart, absent=absent)
     if labels is not None:
         evidence = with_labels(evidence, images, labels)
     return replace(result, evidence=evidence, seconds=result.seconds | {"judge": perf_counter() - began})
