@@ -33,7 +33,7 @@ def disagreement(problem: RegistrationProblem, settings: RegistrationSettings) -
 
     Args:
         problem: two images of one channel, see `to_compare`.
-        settings: by which solver, flow and stencil.
+        settings: whose solver and stencil to use.
 
     Returns:
         ``(B,)`` from 0 to 1.
@@ -46,7 +46,7 @@ def disagreement(problem: RegistrationProblem, settings: RegistrationSettings) -
     grid = Grid(rough.grid.shape)  # in voxels
     both = RegistrationProblem(grid, *_there_and_back(rough.fixed, rough.moving), *_masks(rough))
     with limit_threads(1, grid):
-        quick = replace(_SETTINGS, solver=settings.solver, flow=settings.flow, stencil=settings.stencil)
+        quick = replace(_SETTINGS, solver=settings.solver, stencil=settings.stencil)
         there, back = _maps(both, quick).chunk(2)
         far = (there + warp(back, there, grid)).norm(dim=1, keepdim=True) > _AGREE
     seen = Views.of(rough).seen
