@@ -90,10 +90,11 @@ class Evidence:
 
 
 def to_compare(problem: RegistrationProblem) -> RegistrationProblem:
-    """Return one channel of a problem on a grid of few nodes, all that `gather_evidence` needs."""
+    """Return one channel of a problem on a grid of few nodes and on the CPU, all that `gather_evidence` needs."""
     grey = {name: getattr(problem, name).mean(1, keepdim=True) for name in ("fixed", "moving")}
-    few = smaller(problem.grid, _DETAIL[problem.grid.dim])
-    return replace(problem, **grey, fixed_points=None, moving_points=None).on(few)
+    few = replace(problem, **grey, fixed_points=None, moving_points=None)
+    few = few.on(smaller(problem.grid, _DETAIL[problem.grid.dim]))
+    return replace(few, **{name: None if field is None else field.cpu() for name, field in _fields(few).items()})
 
 
 def smaller(grid: Grid, nodes: int) -> Grid:
@@ -143,8 +144,11 @@ def gather_evidence(
 
 
 def _item(problem: RegistrationProblem, index: int) -> RegistrationProblem:
-    fields = {name: getattr(problem, name) for name in ("fixed", "moving", "fixed_mask", "moving_mask")}
-    return replace(problem, **{name: None if f is None else _part(f, index) for name, f in fields.items()})
+    return replace(problem, **{name: None if f is None else _part(f, index) for name, f in _fields(problem).items()})
+
+
+def _fields(problem: RegistrationProblem) -> dict[str, Tensor | None]:
+    return {name: getattr(problem, name) for name in ("fixed", "moving", "fixed_mask", "moving_mask")}
 
 
 def _part(field: Tensor, index: int) -> Tensor:
@@ -217,7 +221,7 @@ class Views:
         )
         moving = problem.moving
         if u is not None:
-            w = prolong(u, problem.grid)
+            w = prolong(u, problem.grid).to(problem.fixed)
             moving, second = (
                 warp(field, w, problem.grid, outside=outside) for field, outside in ((moving, None), (second, 0.0))
             )
@@ -230,7 +234,7 @@ class Views:
 
     def share(self, field: Tensor) -> float:
         """Return the mean of a field over what has contrast in the fixed image."""
-        return float((field * self.seen).sum() / self.seen.sum().clamp(min=_TINY))
+        return float((field.to(self.seen) * self.seen).sum() / self.seen.sum().clamp(min=_TINY))
 
     def correlation(self) -> float:
         """Return the mean squared correlation in windows around what has contrast."""
@@ -290,8 +294,8 @@ class Views:
         edges = [_edges(image, known) for image in (self.fixed, self.moving)]
         if not all(bool(some.any()) for some in edges):
             return math.inf
-        far = [torch.from_numpy(distance_transform_edt(~some.cpu().numpy())) for some in edges]
-        return float((far[1][edges[0].cpu()].sum() + far[0][edges[1].cpu()].sum()) / sum(int(e.sum()) for e in edges))
+        far = [torch.from_numpy(distance_transform_edt(~some.numpy())) for some in edges]
+        return float(torch.cat([far[1][edges[0]], far[0][edges[1]]]).mean())
 
     def foreground_overlap(self) -> float:
         """Return the Dice overlap of what is brighter than Otsu's threshold, where both images are known."""
@@ -337,7 +341,7 @@ def _edges(image: Tensor, known: Tensor) -> Tensor:
 def otsu(values: Tensor) -> float:
     """Return the threshold that leaves the least variance within the values on either side of it."""
     low, high = (float(end) for end in values.aminmax())
-    count = torch.histc(values.float(), 256, min=low, max=high).double().cpu()
+    count = torch.histc(values.float(), 256, min=low, max=high).double()
     centre = low + (high - low) * (torch.arange(256, dtype=torch.float64) + 0.5) / 256
     below, total = count.cumsum(0), (count * centre).cumsum(0)
     above = below[-1] - below

@@ -105,7 +105,8 @@ def judge(
     found = [*_folds(folds), *_images(evidence, grid.dim, mirror), *_map(evidence)]
     if evaluation is not None and _proven(evaluation) and all(some.kind == GOOD for some in known):
         found = [replace_bad(some) if some.kind == BAD and folds == 0 else some for some in found]
-    found += [*known, *(Finding(LOOK, f"{WARNED}{text}.") for text in warnings)]
+    others = [text for text in warnings if mirror <= _MIRROR or "mirror image" not in text]
+    found += [*known, *(Finding(LOOK, f"{WARNED}{text}.") for text in others)]
     found.sort(key=lambda some: _ORDER.index(some.kind))
     kind = found[0].kind
     return Verdict(kind, _HEADLINES[kind].format(_reason(found[0].text)), tuple(found))
@@ -140,7 +141,7 @@ def _images(evidence: Evidence, dim: int, mirror: float) -> Iterator[Finding]:
         yield Finding(kind, text, {"signs": len(signs), "structure_before": evidence.structure_before})
     if mirror > _MIRROR:
         text = "The moving image looks like a mirror image of the fixed one (mirrored it would fit "
-        text += f"{number(mirror)} times as well)."
+        text += f"{number(mirror)} times as well): check the directions in both headers."
         yield Finding(BAD if mirror > _MIRRORED else LOOK, text, {"mirror": mirror})
     if evidence.turned:
         axes = " and ".join(evidence.turned)
