@@ -277,6 +277,14 @@ def _labels(cases: Cases) -> _Made:
     for index, other in ((0, 5), (2, 9), (7, 3)):
         pair, path = cases._pair("heart_2d", index), cases._pair("heart_2d", other).moving_labels
         yield f"heart_2d {pair.name}, another's", lambda p=pair, q=path: with_labels_of(scene(p, labels=True), q)
+    for name, index, other in (
+        ("mindboggle_2d", 2, 5),
+        ("mindboggle_2d", 4, 0),
+        ("hippocampus_3d", 2, 5),
+        ("hippocampus_3d", 6, 2),
+    ):
+        pair, path = cases._pair(name, index), cases._pair(name, other).moving_labels
+        yield f"{name} {pair.name}, another's", lambda p=pair, q=path: with_labels_of(scene(p, labels=True), q)
     pair = cases._pair("mindboggle_2d", 5)
     yield f"mindboggle_2d {pair.name}, mirrored", partial(_with_changed_labels, pair, flipped(1))
 
