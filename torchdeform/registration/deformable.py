@@ -124,6 +124,7 @@ def _examined(
     labels: tuple[Tensor, Tensor] | None,
 ) -> RegistrationResult:
     """Return the result with its evidence, from images on a grid of few nodes, and labels on the images' own grids."""
+    begin("judging")
     began = perf_counter()
     maps = (result.displacement, result.inverse, result.grid)
     evidence = gather_evidence(compared, *maps, disagreement=disagreement(compared))
