@@ -1,12 +1,14 @@
-"""Two additions to mkdocs: links to files of the project outside docs, and the help texts of the shell.
+"""Three additions to mkdocs: pictures, links to files of the project outside docs, and the help texts of the shell.
 
-`on_page_markdown` is called by mkdocs for each page, see ``hooks`` in mkdocs.yml.
+mkdocs calls `on_files` once and `on_page_markdown` for each page, see ``hooks`` in mkdocs.yml.
 """
 
 import io
 import os
 import re
+import sys
 from contextlib import redirect_stdout
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,6 +19,22 @@ from mkdocs.structure.pages import Page
 _LINK = re.compile(r"(\]\()([^)#\s:]+)(\))")
 _HELP = "<!-- help of all verbs -->"
 _COPIES = "project"  # folder of the site with copies of linked files
+
+
+def on_files(files: Files, /, *, config: MkDocsConfig) -> Files:
+    """Add the pictures, as the commands of the pages make them now."""
+    for name, data in _pictures():
+        files.append(File.generated(config, f"pictures/{name}.jpg", content=data))
+    return files
+
+
+@cache
+def _pictures() -> tuple[tuple[str, bytes], ...]:
+    """Make them once, however often a page is built again."""
+    sys.path.insert(0, str(Path(__file__).parent))
+    from make_docs_pictures import SOURCES, pictures
+
+    return tuple(pictures(list(SOURCES)))
 
 
 def on_page_markdown(markdown: str, /, *, page: Page, config: MkDocsConfig, files: Files) -> str:

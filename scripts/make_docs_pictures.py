@@ -1,66 +1,72 @@
-"""Make docs/pictures: the shell commands of the pages are run as they stand, and their results drawn small.
+"""Make the pictures of the site: the commands of a page are run as they stand, and their result is drawn small.
 
-``python scripts/make_docs_pictures.py [PAGE ...]``. The hearts are read from the folder that TORCHDEFORM_DATA names,
-Chromium photographs the head of the report; where one is missing, that picture is left as it is.
+The site's build does it, see ``docs_hooks.py``. ``python scripts/make_docs_pictures.py FOLDER [PAGE ...]`` writes them.
+Chromium photographs the head of the report; without a browser the page shows the overview in its place.
 """
 
-import os
+import io
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
-PICTURES = ROOT / "docs" / "pictures"
 WIDTH = 1000
 
 # Which file of a page's results is its picture.
 SOURCES = {
+    "start": "results/report.html",
     "how-to/brains": "brains/results/overview.png",
     "how-to/lungs": "lungs/results/overview.png",
-    "how-to/hearts": "heart/overview.png",
+    "how-to/hearts": "hearts/results/overview.png",
     "how-to/histology": "histology/results/overview.png",
     "how-to/contrasts": "contrasts/results/overview.png",
     "how-to/grids": "results/grid/grid.png",
     "how-to/volume-change": "contrasts/atrophy/grid.png",
-    "start": "results/report.html",
 }
-# The names that the page on hearts gives to the files of the data folder.
-HEARTS = {
-    f"{phase}{kind}.png": f"SC-HF-I-09_slice12_{phase}{kind}.png" for phase in ("ED", "ES") for kind in ("", "_label")
-}
+# What else is shown of a page's results.
+MORE = {"start": {"overview": "results/overview.png"}}
 
 
-def commands(page: str) -> list[str]:
-    """Return the lines of a page's shell blocks that run torchdeform or one of the project's scripts."""
+def commands(page: str) -> list[list[str]]:
+    """Return the words of the lines of a page that run torchdeform or one of the project's scripts."""
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
-    lines = [
-        line
-        for block in re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
-        for line in block.splitlines()
-    ]
-    return [line for line in lines if line.startswith(("register ", "torchdeform ", "python scripts/"))]
+    blocks = re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    lines = [shlex.split(line, comments=True) for block in blocks for line in block.splitlines()]
+    return [words for words in lines if words and words[0] in ("register", "torchdeform", "python")]
 
 
-def run(page: str, folder: Path) -> Path | None:
-    """Run a page's commands in a folder and return its picture, None if it was not made."""
-    for name in ("examples", "scripts", "configs"):
-        (folder / name).symlink_to(ROOT / name)
-    data = Path(os.environ.get("TORCHDEFORM_DATA", ROOT.parent / "shared" / "data")) / "heart_2d"
-    for ours, theirs in HEARTS.items():
-        if (data / theirs).is_file():
-            shutil.copy(data / theirs, folder / ours)
-    path = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
-    python = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    for line in commands(page):
-        done = subprocess.run(["bash", "-c", line], cwd=folder, env={**os.environ, "PATH": path, "PYTHONPATH": python})
-        print(f"{page}: {done.returncode}: {line}")
-    picture = folder / SOURCES[page]
-    return picture if picture.is_file() else None
+def run(words: list[str]) -> int:
+    """Run a command of a page in this process."""
+    from phantoms import main as phantoms
+
+    from torchdeform.cli.main import main, torchdeform
+
+    programs: dict[str, Callable[[list[str]], int | None]] = {"register": main, "torchdeform": torchdeform}
+    if words[:2] == ["python", "scripts/phantoms.py"]:
+        return phantoms(words[2:]) or 0
+    return programs[words[0]](words[1:]) or 0 if words[0] in programs else 1
+
+
+def picture(page: str, folder: Path) -> Path:
+    """Run a page's commands in a folder until its picture is there, and return that."""
+    found, said = folder / SOURCES[page], io.StringIO()
+    (folder / "examples").symlink_to(ROOT / "examples")
+    with chdir(folder), redirect_stdout(said), redirect_stderr(said):
+        for words in commands(page):
+            if found.is_file():
+                break
+            run(words)
+    if not found.is_file():
+        raise RuntimeError(f"the commands of {page} do not make {SOURCES[page]}:\n{said.getvalue()}")
+    return found if found.suffix == ".png" else photograph(found) or found.with_name("overview.png")
 
 
 def photograph(report: Path) -> Path | None:
@@ -68,28 +74,30 @@ def photograph(report: Path) -> Path | None:
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if browser is None:
         return None
-    picture = report.with_suffix(".png")
+    image = report.with_suffix(".png")
     options = ("--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--window-size=1000,1000")
-    subprocess.run([browser, *options, f"--screenshot={picture}", report.as_uri()], check=True, capture_output=True)
-    return picture
+    subprocess.run([browser, *options, f"--screenshot={image}", report.as_uri()], check=True, capture_output=True)
+    return image
 
 
-def main(pages: list[str]) -> None:
-    """Make the pictures of the pages that are named, of all if none is."""
-    PICTURES.mkdir(exist_ok=True)
-    for page in pages or SOURCES:
+def small(path: Path) -> bytes:
+    """Return a picture as a JPEG that is no larger than a page."""
+    image, file = Image.open(path).convert("RGB"), io.BytesIO()
+    image.thumbnail((WIDTH, WIDTH))
+    image.save(file, "JPEG", quality=80, optimize=True)
+    return file.getvalue()
+
+
+def pictures(pages: list[str]) -> Iterator[tuple[str, bytes]]:
+    """Yield the names of the pictures of some pages, and their JPEGs."""
+    for page in pages:
         with tempfile.TemporaryDirectory() as folder:
-            found = run(page, Path(folder))
-            if found is not None and found.suffix == ".html":
-                found = photograph(found)
-            if found is None:
-                print(f"{page}: no picture")
-                continue
-            image = Image.open(found).convert("RGB")
-            image.thumbnail((WIDTH, WIDTH))
             name = "report" if page == "start" else Path(page).name
-            image.save(PICTURES / f"{name}.jpg", quality=80, optimize=True)
+            yield name, small(picture(page, Path(folder)))
+            for other, path in MORE.get(page, {}).items():
+                yield other, small(Path(folder) / path)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    for name, data in pictures(sys.argv[2:] or list(SOURCES)):
+        Path(sys.argv[1], f"{name}.jpg").write_bytes(data)

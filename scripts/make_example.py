@@ -5,7 +5,6 @@ The picture is a fundus photograph of a normal left eye (Häggström 2014, publi
 
 import math
 import sys
-import tempfile
 from pathlib import Path
 
 import torch
@@ -49,16 +48,10 @@ def make_pair() -> None:
 
 
 def make_picture() -> None:
-    """Register the pair and write ``examples/overview.jpg``, the picture of the README."""
-    from PIL import Image as Picture
+    """Write ``examples/overview.jpg``, the picture of the README: that of the site's first page, as it is now."""
+    from make_docs_pictures import pictures
 
-    from torchdeform.pipeline.register import PairFiles, register_files
-
-    with tempfile.TemporaryDirectory() as folder:
-        fixed, moving = (ROOT / "examples" / name for name in ("fixed.png", "moving.png"))
-        register_files(PairFiles(fixed=fixed, moving=moving, out=Path(folder)), td.load_settings())
-        picture = Picture.open(Path(folder) / "overview.png").convert("RGB")
-    picture.save(ROOT / "examples" / "overview.jpg", quality=82, optimize=True)
+    (ROOT / "examples" / "overview.jpg").write_bytes(dict(pictures(["start"]))["overview"])
 
 
 if __name__ == "__main__":

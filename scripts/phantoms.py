@@ -54,6 +54,25 @@ def lungs(out: Path) -> None:
         (out / f"{name}.csv").write_text("\n".join(["index,x,y,z", *rows]) + "\n", encoding="utf-8")
 
 
+def hearts(out: Path) -> None:
+    """A slice across a heart, filled (ED) and contracted (ES), with labels: 1 cavity, 2 muscle."""
+    grid = td.Grid((128, 128), (1.5, 1.5))
+    y, x = (grid.points() - 95.0).split(1, dim=1)
+    radius = (x.square() + (1.1 * y).square()).sqrt()
+    labels = torch.where(radius < 26, 1, torch.where(radius < 38, 2, 0))
+    lung = ((x + 15) / 70) ** 2 + ((y + 5) / 60) ** 2 < 1
+    blood = ((((x + 34) / 30) ** 2 + ((y + 6) / 38) ** 2 < 1) & (labels == 0)) | (labels == 1)
+    shade = 60.0 + 50 * _noise(grid.shape, 2.5, 11).clamp(-1, 1)
+    values = torch.where(lung, 25.0 + 8 * _noise(grid.shape, 1.5, 12), shade)
+    values = torch.where(blood, 190.0, torch.where(labels == 2, 75.0, values)) + 6 * _noise(grid.shape, 0.8, 13)
+    inwards = 17 * (radius / 26) * torch.exp(1 - (radius / 26) ** 1.5) / radius.clamp(min=1)
+    u = td.integrate(torch.cat([y, x], dim=1) * inwards / 2.2, grid)
+    for name, w in (("ED", torch.zeros_like(u)), ("ES", u)):
+        _write(out / f"{name}.png", td.warp(values, w, grid).clamp(0, 255), grid, kind="uint8")
+        parts = [td.warp((labels == k).float(), w, grid) for k in range(3)]
+        _write(out / f"{name}_label.png", torch.cat(parts, dim=1).argmax(1, keepdim=True), grid, kind="uint8")
+
+
 def histology(out: Path) -> None:
     """A stained section, and one of a second stain that lies turned on its slide."""
     from skimage import color, data
@@ -131,7 +150,7 @@ def _write(path: Path, values: Tensor, grid: td.Grid, *, kind: str = "float32", 
     td.write_image(td.Image(values.float(), grid, origin, pixel_type=kind), path)
 
 
-KINDS = {"brains": brains, "lungs": lungs, "histology": histology, "contrasts": contrasts}
+KINDS = {"brains": brains, "lungs": lungs, "hearts": hearts, "histology": histology, "contrasts": contrasts}
 
 
 def main(names: list[str]) -> None:

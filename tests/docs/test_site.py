@@ -9,7 +9,9 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from torchdeform.pipeline.config import preset_names
 
@@ -86,8 +88,18 @@ def test_every_preset_is_shown():
     assert all(f"## {name}\n" in text and f"presets/{name}.yaml" in text for name in preset_names())
 
 
-def test_pictures_are_small():
-    files = [path for path in (ROOT / "docs").rglob("*") if path.suffix in (".png", ".jpg")]
-    assert len(files) >= 8
-    assert all(path.stat().st_size < 250_000 for path in files)
+def test_pictures_are_made_by_the_build_and_small(site):
+    files = list((site / "pictures").iterdir())
+    names = {"report", "overview", "brains", "lungs", "hearts", "histology", "contrasts", "grids", "volume-change"}
+    assert {path.name for path in files} == {f"{name}.jpg" for name in names}
+    assert not (ROOT / "docs" / "pictures").exists()
+    assert all(5_000 < path.stat().st_size < 250_000 for path in files)
     assert sum(path.stat().st_size for path in files) < 2_000_000
+
+
+def test_the_picture_of_the_readme_is_what_the_default_makes(site):
+    """If not, ``python scripts/make_example.py`` makes it anew."""
+    now, then = (Image.open(path) for path in (site / "pictures" / "overview.jpg", ROOT / "examples" / "overview.jpg"))
+    assert now.size == then.size
+    small = [np.asarray(image.convert("RGB").resize((100, 60)), float) for image in (now, then)]
+    assert np.abs(small[0] - small[1]).mean() < 6

@@ -1,15 +1,11 @@
 """Every Python snippet of the site runs, and every command: those whose files are there run, the others parse."""
 
-import importlib.util
-import os
 import re
 import runpy
 import shlex
-import shutil
 import sys
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import yaml
@@ -41,15 +37,6 @@ GIVEN = {
 # Programs that are not ours: only the files of the project that they are given are looked at.
 OTHERS = ("python3", "pip", ".", "export", "torchrun", "docker", "kubectl", "sbatch", ".venv/bin/register")
 FILES = {".png", ".h5", ".gz", ".mha", ".csv", ".txt", ".json", ".yaml", ".mat", ".fcsv", ".nii"}
-
-
-def script(name: str) -> ModuleType:
-    """Return a script of the project as a module."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
-    assert spec is not None and spec.loader is not None  # noqa: PT018
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python") and p not in ELSEWHERE])
@@ -90,13 +77,9 @@ def quick(monkeypatch):
 
 @pytest.fixture
 def workplace(tmp_path, monkeypatch) -> Path:
-    """A working folder that looks like the project's to commands of the pages, with the files of the page on hearts."""
+    """A working folder that looks like the project's to commands of the pages."""
     for name in ("examples", "scripts", "configs"):
         (tmp_path / name).symlink_to(ROOT / name)
-    data = Path(os.environ.get("TORCHDEFORM_DATA", ROOT.parent / "shared" / "data")) / "heart_2d"
-    for ours, theirs in script("make_docs_pictures").HEARTS.items():
-        if (data / theirs).is_file():
-            shutil.copy(data / theirs, tmp_path / ours)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -121,7 +104,7 @@ def test_commands_run(page, workplace, quick, capsys, monkeypatch):
             assert words[0] in ("python", *OTHERS), line
             ours = [word for word in words if word.startswith(("scripts/", "examples/", "configs/"))]
             assert all((ROOT / word).is_file() for word in ours), line
-    if page.startswith("docs/how-to/") and not page.endswith(("training.md", "hearts.md")):
+    if page.startswith("docs/how-to/") and not page.endswith("training.md"):
         assert ran
 
 

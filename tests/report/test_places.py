@@ -9,6 +9,7 @@ import torch
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.registration.problem import Annotations
+from torchdeform.registration.result import RegistrationResult
 from torchdeform.report.landmarks import landmarks_of
 from torchdeform.report.places import chosen_slices, span, worst_place
 from torchdeform.report.planes import planes_of
@@ -35,7 +36,7 @@ def test_empty_slices_are_left_out():
     assert span(torch.ones(1, 1, 20, 16, 12), 0) == (0, 19)
 
 
-def _pair(make_result, dim: int, spot: tuple[int, ...]) -> tuple[Image, Image, object]:
+def _pair(make_result, dim: int, spot: tuple[int, ...]) -> tuple[Image, Image, RegistrationResult]:
     """Two equal images, one of which has another grey value around a spot; the map is the identity."""
     shape = (40, 44, 48)[-dim:]
     data = torch.rand(1, 1, *shape, generator=torch.Generator().manual_seed(0))

@@ -1,7 +1,7 @@
 """Drawing on matplotlib axes: slices of images, maps with their scales, deformed grids, curves."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
@@ -201,8 +201,8 @@ def draw_convergence(axes: "Axes", result: RegistrationResult, *, item: int = 0)
         axes.legend(fontsize=8, frameon=False, loc="best")
 
 
-def draw_volumes(axes: "Axes", counts: Tensor, limit: float) -> None:
-    """Draw a histogram of log J between −limit and limit, written as J, in the colours of the map."""
+def draw_volumes(axes: "Axes", counts: Tensor, limit: float, words: Mapping[str, str]) -> None:
+    """Draw a histogram of log J between −limit and limit, written as J, in the colours of the map; see `WORDS`."""
     from matplotlib import colormaps
 
     share = 100 * counts.numpy() / max(float(counts.sum()), 1.0)
@@ -213,7 +213,7 @@ def draw_volumes(axes: "Axes", counts: Tensor, limit: float) -> None:
     axes.axvline(0, color=INK, linewidth=0.8, linestyle=":")
     axes.set_xlim(-limit, limit)
     axes.set_xticks([value for value, _ in scale.ticks], labels=[text for _, text in scale.ticks])
-    _name_axes(axes, "volume: moving / fixed", "% of voxels")
+    _name_axes(axes, f"{words['volume']}: moving / fixed", f"% of {words['voxel']}s")
 
 
 def _name_axes(axes: "Axes", across: str, down: str) -> None:

@@ -32,7 +32,7 @@ from torchdeform.report.drawing import (
     volume_scale,
 )
 from torchdeform.report.marks import ABSENT, LANDMARKS, NO_DATA, OUTLINES, REGIONS
-from torchdeform.report.planes import Plane, planes_of
+from torchdeform.report.planes import WORDS, Plane, planes_of
 from torchdeform.report.report_data import ReportData, Slices
 from torchdeform.report.sampling import FIXED, MOVING, WARPED, grey, to_unit
 from torchdeform.report.sheet import GAP, TITLE, Sheet, letters_in, shortened, title
@@ -103,7 +103,7 @@ def _draw_convergence(axes: "Axes", result: "RegistrationResult", width: float, 
 def _title(panel: str, result: "RegistrationResult") -> str:
     """Return the title of a panel; the moving image is shown after the alignment."""
     if panel == _VOLUME:
-        return f"{'area' if result.grid.dim == 2 else 'volume'}: moving / fixed"
+        return f"{WORDS[result.grid.dim]['volume']}: moving / fixed"
     return f"{panel}, aligned" if panel == "moving" and result.affine is not None else panel
 
 
@@ -111,7 +111,7 @@ def _headlines(data: ReportData, most: int) -> tuple[str, str]:
     """Return the names of the files in so many letters, and the most important figures."""
     result, diagnosis = data.result, data.result.diagnosis
     before, after = result.similarity_before.item(), result.similarity_after.item()
-    voxel = "pixel" if result.grid.dim == 2 else "voxel"
+    voxel = WORDS[result.grid.dim]["voxel"]
     names = [shortened(Path(image.name).name, most // 2 - 3) for image in (data.moving, data.fixed)]
     return " onto ".join(names), "     ".join(
         (

@@ -50,6 +50,6 @@ def landmarks_of(fixed: Image, result: RegistrationResult, annotations: Annotati
     return Landmarks(
         fixed=start[0].T / spacing,
         moved={stage: end[0].T / spacing for stage, end in ends.items()},
-        distances={stage: landmark_distances(world, there)[0] for stage, world in maps.items()},
-        unit=getattr(fixed, "unit", "mm"),
+        distances={stage: fixed.in_unit(landmark_distances(world, there)[0]) for stage, world in maps.items()},
+        unit=fixed.unit,
     )

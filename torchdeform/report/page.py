@@ -23,8 +23,8 @@ from torchdeform.report.drawing import (
     volume_scale,
 )
 from torchdeform.report.legend import legend
-from torchdeform.report.marks import ABSENT, REGIONS, WORST, Mark
-from torchdeform.report.planes import SIDES
+from torchdeform.report.marks import ABSENT, NO_DATA, REGIONS, WORST, Mark
+from torchdeform.report.planes import SIDES, WORDS
 from torchdeform.report.record import describe
 from torchdeform.report.report_data import ReportData, Slices
 from torchdeform.report.sampling import FIXED, MOVING, ORIGINAL, WARPED
@@ -139,7 +139,10 @@ def fitting_pictures(data: ReportData) -> dict[str, object]:
         "data": {plane["name"]: {key: plane[key] for key in _SCRIPTED} for plane in planes},
         "choices": [{"name": name, "title": title} for name, title in _others(data).items()],
         "lines": lines,
-        "over_stage": [line for line in lines if line.mark.kind != GRID],
+        "stage_lines": {
+            "above": [line for line in lines if line.mark.kind == NO_DATA],  # part of the image that is compared
+            "over": [line for line in lines if line.mark.kind not in (GRID, NO_DATA)],
+        },
         "legend": legend(data),
         "hatch": UNITS * max(max(frame.down, frame.across) for _, frame in frames) // _HATCHES,
         "differences": pictures.pop("Differences"),
@@ -215,7 +218,7 @@ class _Renderer:
     def _maps(self) -> Iterator[Picture]:
         limits, dim = self._data.limits, self._data.result.grid.dim
         yield Picture(GRID, "Deformed grid", _CAPTIONS[GRID], lines=self._over(FIXED, GRID))
-        size, scale = ("Area", "Volume")[dim - 2], volume_scale(limits["log_det"])
+        size, scale = WORDS[dim]["volume"].capitalize(), volume_scale(limits["log_det"])
         yield self._map("log_det", f"{size}: moving / fixed", scale, self._over(FIXED, ABSENT))
         yield self._map("divergence", "Divergence", signed_scale(limits["divergence"]))
         yield self._map(
@@ -225,7 +228,7 @@ class _Renderer:
 
     def _map(self, name: str, title: str, scale: Scale, lines: Sequence[Line] = ()) -> Picture:
         """Return a picture in the colours of a scale."""
-        caption = _CAPTIONS[name].format(**_WORDS[self._data.result.grid.dim])
+        caption = _CAPTIONS[name].format(**WORDS[self._data.result.grid.dim])
         return Picture(name, title, caption, self._strips(name, scale), lines, bar_of(scale))
 
     def _strips(self, name: str, scale: Scale | None) -> dict[str, str]:
@@ -240,7 +243,6 @@ class _Renderer:
 
 
 _SMOOTH = ("log_det", "divergence", "rotation", "inverse_error")
-_WORDS = {2: {"voxel": "pixel", "volume": "area"}, 3: {"voxel": "voxel", "volume": "volume"}}
 _CAPTIONS = {
     "fixed": "The image that stays.",
     "warped": "The moving image after the map: it should look like the fixed one.",
@@ -282,11 +284,15 @@ def _curves(data: ReportData) -> list[dict[str, object]]:
     from markupsafe import Markup
 
     limit, measure = data.limits["log_det"], measure_name(data.result.settings.similarity.measure)
-    words = _WORDS[data.result.grid.dim]
+    words = WORDS[data.result.grid.dim]
     about_volumes = "How often each change of {volume} occurs, over all {voxel}s.".format(**words)
     about_steps = f"Similarity ({measure}) over the steps, by level."
     curves = (
-        (f"{words['volume'].capitalize()}s", about_volumes, lambda axes: draw_volumes(axes, data.volumes, limit)),
+        (
+            f"{words['volume'].capitalize()}s",
+            about_volumes,
+            lambda axes: draw_volumes(axes, data.volumes, limit, words),
+        ),
         ("Convergence", about_steps, lambda axes: draw_convergence(axes, data.result)),
     )
     return [

@@ -13,6 +13,8 @@ from torchdeform.errors import InputError, require_choice
 
 PLANES = ("axial", "coronal", "sagittal")
 SIDES = ("left", "right", "top", "bottom")
+# What a piece of an image and its size are called in 2D and in 3D.
+WORDS = {2: {"voxel": "pixel", "volume": "area"}, 3: {"voxel": "voxel", "volume": "volume"}}
 _OPPOSITE = dict(zip("LRPAIS", "RLAPSI", strict=True))
 
 

@@ -13,7 +13,7 @@ from torchdeform.core.warp import compose, voxels
 from torchdeform.errors import InputError
 from torchdeform.registration.result import RegistrationResult
 from torchdeform.report import drawing
-from torchdeform.report.planes import Plane, chosen_plane
+from torchdeform.report.planes import WORDS, Plane, chosen_plane
 from torchdeform.report.report_data import (
     end_of_scale,
     log_volume,
@@ -257,8 +257,9 @@ def plot_volume_histogram(u: Tensor, space: Image | Grid, *, axes: "Axes | None"
     Raises:
         InputError: shape of u.
     """
-    (values, limit), axes = _log_determinant(u, _place(space).grid), _axes(axes)
-    drawing.draw_volumes(axes, volume_counts(values, limit), limit)
+    grid, axes = _place(space).grid, _axes(axes)
+    values, limit = _log_determinant(u, grid)
+    drawing.draw_volumes(axes, volume_counts(values, limit), limit, WORDS[grid.dim])
     return axes
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchdeform.core.image import Image, background, luminance, same_place
+from torchdeform.core.image import Image, luminance, same_place, surroundings
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import inside_box, sample
 from torchdeform.registration.problem import Annotations
@@ -96,7 +96,7 @@ class _Side:
     def __init__(self, image: Image, labels: object, mask: object) -> None:
         self._image, self._labels, self._mask = image, labels, mask
         self._data = _with_grey(image)
-        self._empty = [float(background(channel[None, None])) for channel in self._data[0]]
+        self._empty = surroundings(replace(image, data=self._data))
         self._colours, self._grey = ends(image.data), ends(self._data[:, -1:])
 
     def at(self, nodes: _Nodes, values: Tensor | None, *, labels: bool = True, mask: bool = True) -> Sampled:
@@ -105,7 +105,7 @@ class _Side:
         inside = inside_box(place, self._image.grid)
         if values is None:
             values = sample(self._data, place, self._image.grid)
-            values = values.where(inside, values.new_tensor(self._empty).view(1, -1, *[1] * self._image.grid.dim))
+            values = values.where(inside, self._empty.view(1, -1, *[1] * self._image.grid.dim))
         greys = _between(values[:, -1:], *self._grey)
         colours = _between(values[:, :3], *self._colours) if values.shape[1] > 1 else greys
         parts = (self._labels if labels else None, self._mask if mask else None)

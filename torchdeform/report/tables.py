@@ -8,6 +8,7 @@ from typing import Any
 
 from torchdeform.metrics.similarity import measure_name
 from torchdeform.registration.verdict import number
+from torchdeform.report.planes import WORDS
 from torchdeform.report.record import apply_commands
 
 _LONG = 12  # a table with more rows is folded
@@ -67,13 +68,13 @@ def file_name(place: Mapping[str, Any]) -> str:
 
 def tiles(record: Record) -> list[Tile]:
     """Return the most important figures."""
-    frames = {2: 4, 3: 10}[len(record["fixed"]["size"])]
+    frames, words = {2: 4, 3: 10}[len(record["fixed"]["size"])], _words(record)
     low, high = number(record["determinant_min"]), number(record["determinant_max"])
     return [
         Tile(
             "Folds",
             f"{record['folds']:,}",
-            f"voxels where one of the {frames} one-sided determinants is not positive",
+            f"{words['voxel']}s where one of the {frames} one-sided determinants is not positive",
         ),
         Tile(
             f"Similarity ({measure_name(record['similarity'])})",
@@ -81,11 +82,15 @@ def tiles(record: Record) -> list[Tile]:
             "before → after the deformation; higher is better",
         ),
         *_accuracy(record),
-        Tile("Volume, moving / fixed", f"{low} to {high}", "smallest and largest determinant of the map"),
+        Tile(
+            f"{words['volume'].capitalize()}, moving / fixed",
+            f"{low} to {high}",
+            "smallest and largest determinant of the map",
+        ),
         Tile(
             "Inverse consistency",
-            f"{_voxels(record['inverse_error_mean'])}",
-            f"on average; {_voxels(record['inverse_error_max'])} at most",
+            _voxels(record, "inverse_error_mean"),
+            f"on average; {_voxels(record, 'inverse_error_max')} at most",
         ),
         Tile("Time", _seconds(sum(record["seconds"].values())), f"on {record['device']}"),
     ]
@@ -104,8 +109,13 @@ def _accuracy(record: Record) -> list[Tile]:
     return found
 
 
-def _voxels(length: float | None) -> str:
-    return "< 0.001 voxel" if 0 <= value(length) < 1e-3 else f"{number(length)} voxel"
+def _words(record: Record) -> Mapping[str, str]:
+    return WORDS[len(record["fixed"]["size"])]
+
+
+def _voxels(record: Record, key: str) -> str:
+    length, voxel = record[key], _words(record)["voxel"]
+    return f"< 0.001 {voxel}" if 0 <= value(length) < 1e-3 else f"{number(length)} {voxel}"
 
 
 def _seconds(time: float) -> str:
@@ -208,7 +218,10 @@ def _images(record: Record) -> Table:
         for option, path in record.get("inputs", {}).items()
         if option not in ("fixed", "moving")
     ]
-    return Table("Files", [Part(["", "file", "voxels", "spacing", "channels", "type"], rows + inputs, words=1)])
+    return Table(
+        "Files",
+        [Part(["", "file", f"{_words(record)['voxel']}s", "spacing", "channels", "type"], rows + inputs, words=1)],
+    )
 
 
 def _settings(record: Record) -> Table:
