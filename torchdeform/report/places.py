@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
+import numpy as np
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
@@ -88,5 +88,5 @@ def _densest(values: Tensor, step: Sequence[int], grid: Grid) -> tuple[float, ..
     """Return the node around which values at every ``step``-th node are largest."""
     window = [min(_WINDOW, n - 1 + n % 2) for n in values.shape[2:]]
     mean = AVERAGE_POOL[grid.dim](values, window, 1, [w // 2 for w in window])
-    index = torch.unravel_index(mean.flatten().argmax(), mean.shape[2:])
+    index = np.unravel_index(int(mean.argmax()), mean.shape[2:])  # torch's loads sympy for it
     return tuple(float(min(int(k) * h + h // 2, n - 1)) for k, h, n in zip(index, step, grid.shape, strict=True))
