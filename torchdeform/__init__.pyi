@@ -47,6 +47,7 @@ from .registration.affine.align import Alignment, align
 from .registration.affine.settings import AlignmentSettings
 from .registration.deformable import register
 from .registration.discrete import discrete_start
+from .registration.evidence import Evidence
 from .registration.problem import Annotations
 from .registration.result import RegistrationResult
 from .registration.settings import (
@@ -54,6 +55,7 @@ from .registration.settings import (
     RegistrationSettings,
 )
 from .registration.template import AveragingSettings, Template, build_template
+from .registration.verdict import Finding, Verdict
 from .solvers.base import Solution, Status
 
 __version__: str
@@ -61,9 +63,10 @@ __version__: str
 # fmt: off
 __all__ = [
     "Affine", "Alignment", "AlignmentSettings", "Annotations", "AveragingSettings", "ComputationError",
-    "DeformationSettings", "Diagnosis", "DiscreteSettings", "Displacement", "Evaluation", "Grid", "Image", "InputError",
-    "Measures", "MonitorSettings", "NewtonSettings", "OdeSolver", "RegistrationResult", "RegistrationSettings",
-    "Solution", "SolverSettings", "Status", "Template", "TorchdeformError", "Transform", "Weights", "align",
+    "DeformationSettings", "Diagnosis", "DiscreteSettings", "Displacement", "Evaluation", "Evidence", "Finding", "Grid",
+    "Image", "InputError", "Measures", "MonitorSettings", "NewtonSettings", "OdeSolver", "RegistrationResult",
+    "RegistrationSettings", "Solution", "SolverSettings", "Status", "Template", "TorchdeformError", "Transform",
+    "Verdict", "Weights", "align",
     "average_maps", "ball_monitor", "box_monitor", "build_template", "compose", "curl", "curvature_monitor",
     "density_monitor", "diagnose", "dice", "discrete_start", "divergence", "find_velocity", "from_jacobian_and_curl",
     "gradient_monitor", "grid_from_initial_monitor", "grid_from_target_monitor", "hausdorff", "integrate", "invert",

@@ -44,10 +44,10 @@ def misses(rows: Iterable[tuple[Case, td.Verdict]]) -> list[str]:
     found = []
     for case, verdict in rows:
         must = case.kind in MUST_BE_BAD
-        wrong = (
-            verdict.kind != GOOD if case.kind == GOOD_PAIR else verdict.kind == GOOD or (must and verdict.kind != BAD)
+        allowed = {GOOD} if case.kind == GOOD_PAIR else {BAD} if must else {LOOK, BAD}
+        found += (
+            [f"{case.kind} | {case.name}: {verdict.kind}. {verdict.headline}"] if verdict.kind not in allowed else []
         )
-        found += [f"{case.kind} | {case.name}: {verdict.kind}. {verdict.headline}"] if wrong else []
     return found
 
 

@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from torchdeform.io.points import matched, read_points
 from torchdeform.registration.problem import Annotations
 
 GOOD_PAIR = "good pair"
+_Part = TypeVar("_Part")
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ def picture(name: str) -> td.Image:
     return td.Image(torch.from_numpy(values)[None, None], grid, name=name, pixel_type="uint8")
 
 
-def relabelled(image: td.Image, shift: int) -> td.Image:
+def relabelled(image: td.Image, shift: int = 1) -> td.Image:
     """Give every label the number of another one."""
     names = image.data.unique()
     names = names[names != 0]
@@ -144,15 +146,25 @@ def relabelled(image: td.Image, shift: int) -> td.Image:
     return replace(image, data=data)
 
 
-def with_labels_of(given: Scene, other: Path | td.Image) -> Scene:
-    labels = read_labels(other) if isinstance(other, Path) else other
+def with_labels_of(given: Scene, other: Path | td.Image | None) -> Scene:
+    labels = other if isinstance(other, td.Image) else read_labels(_known(other))
     return replace(given, annotations=replace(given.annotations, moving_labels=labels))
 
 
+def _with_changed_labels(pair: Pair, change: Callable[[td.Image], td.Image]) -> Scene:
+    return with_labels_of(scene(pair, labels=True), change(read_labels(_known(pair.moving_labels))))
+
+
 def with_points_rolled(given: Scene, steps: int) -> Scene:
-    points = given.annotations.moving_points
-    assert points is not None
+    points = _known(given.annotations.moving_points)
     return replace(given, annotations=replace(given.annotations, moving_points=points.roll(steps, 2)))
+
+
+def _known(part: _Part | None) -> _Part:
+    """Return what a case cannot be made without."""
+    if part is None:
+        raise ValueError("the set of images is not complete")
+    return part
 
 
 class Cases:
@@ -223,18 +235,29 @@ def _level(cases: Cases) -> _Made:
         yield " <- ".join(names), lambda a=first, b=second: cases._mixed(("heart_2d", a), ("heart_2d", b))
 
 
+# Left and right of these look alike, so only labels can tell a mirror image of another animal or person.
+_SYMMETRIC = ("mindboggle_2d", "mouse_brain_3d")
+
+
 def _mirrored(cases: Cases) -> _Made:
     spots = [_SPOTS[name] for name in ("heart", "slice", "hippocampus", "section", "spine", "lung", "mouse")]
     spots += [("heart_2d", 4), ("heart_2d", 10), ("mindboggle_2d", 3), ("hippocampus_3d", 4), ("histology_2d", 2)]
     for name, index in spots:
+        pair, labels = cases._pair(name, index), name in _SYMMETRIC
+        told = ", with labels" if labels else ""
+        yield f"{name} {pair.name}{told}", lambda p=pair, k=labels: changed(p, flipped(1), labels=k)
+
+
+def _mirrored_unlabelled(cases: Cases) -> _Made:
+    for name, index in (("mindboggle_2d", 2), ("mouse_brain_3d", 1)):
         pair = cases._pair(name, index)
         yield f"{name} {pair.name}", lambda p=pair: changed(p, flipped(1))
 
 
 def _upside_down(cases: Cases) -> _Made:
     for name, index in (("heart_2d", 1), ("mindboggle_2d", 1), ("hippocampus_3d", 1), ("histology_2d", 1)):
-        pair = cases._pair(name, index)
-        yield f"{name} {pair.name}, rows", lambda p=pair: changed(p, flipped(2))
+        pair, labels = cases._pair(name, index), name in _SYMMETRIC
+        yield f"{name} {pair.name}, rows", lambda p=pair, k=labels: changed(p, flipped(2), labels=k)
     for name, index in (("heart_2d", 7), ("mindboggle_2d", 5)):
         pair = cases._pair(name, index)
         yield f"{name} {pair.name}, turned, not aligned", lambda p=pair: changed(p, flipped(1, 2), align="none")
@@ -250,16 +273,12 @@ def _half(cases: Cases) -> _Made:
 def _labels(cases: Cases) -> _Made:
     for name, index in (("mindboggle_2d", 0), ("hippocampus_3d", 0), ("mindboggle_2d", 3), ("hippocampus_3d", 5)):
         pair = cases._pair(name, index)
-        assert pair.moving_labels is not None
-        make = lambda p=pair: with_labels_of(scene(p, labels=True), relabelled(read_labels(p.moving_labels), 1))  # noqa: E731
-        yield f"{name} {pair.name}, other numbers", make
+        yield f"{name} {pair.name}, other numbers", partial(_with_changed_labels, pair, relabelled)
     for index, other in ((0, 5), (2, 9), (7, 3)):
         pair, path = cases._pair("heart_2d", index), cases._pair("heart_2d", other).moving_labels
-        assert path is not None
         yield f"heart_2d {pair.name}, another's", lambda p=pair, q=path: with_labels_of(scene(p, labels=True), q)
     pair = cases._pair("mindboggle_2d", 5)
-    mirror = lambda p=pair: with_labels_of(scene(p, labels=True), flipped(1)(read_labels(p.moving_labels)))  # noqa: E731
-    yield f"mindboggle_2d {pair.name}, mirrored", mirror
+    yield f"mindboggle_2d {pair.name}, mirrored", partial(_with_changed_labels, pair, flipped(1))
 
 
 def _landmarks(cases: Cases) -> _Made:
@@ -313,9 +332,9 @@ def changed_image(pair: Pair, change: Callable[[td.Image], td.Image], **override
 
 def _heavy_noise(cases: Cases) -> _Made:
     for name, index, strength in (
-        ("heart_2d", 3, 3.0),
-        ("mindboggle_2d", 2, 3.0),
-        ("hippocampus_3d", 3, 2.0),
+        ("heart_2d", 3, 8.0),
+        ("mindboggle_2d", 2, 8.0),
+        ("hippocampus_3d", 3, 5.0),
         ("spine_t1t2_3d", 0, 3.0),
     ):
         pair = cases._pair(name, index)
@@ -358,8 +377,7 @@ def _destroyed(cases: Cases) -> _Made:
     yield swapped.name, lambda: scene(swapped, labels=True, similarity="lncc")
     for name, index in (("mindboggle_2d", 2), ("heart_2d", 11), ("hippocampus_3d", 2)):
         pair = cases._pair(name, index)
-        make = lambda p=pair: replace(scene(p, labels=True, similarity="ssd"), moving=inverted(td.read_image(p.moving)))  # noqa: E731
-        yield f"{name} {pair.name}", make
+        yield f"{name} {pair.name}", lambda p=pair: changed_image(p, inverted, labels=True, similarity="ssd")
 
 
 _KINDS: dict[str, Callable[[Cases], _Made]] = {
@@ -367,6 +385,7 @@ _KINDS: dict[str, Callable[[Cases], _Made]] = {
     "another organ": _organ,
     "wrong level": _level,
     "mirrored": _mirrored,
+    "mirrored, symmetric": _mirrored_unlabelled,
     "upside down": _upside_down,
     "half": _half,
     "labels swapped": _labels,

@@ -34,11 +34,12 @@ def landmarks(before: list[float], after: list[float]) -> Evaluation:
         ({"correlation_before": 1.0, "correlation": 1.0, "information_before": 1.0, "information": 1.0}, GOOD, "fit"),
         ({"information": 0.35}, LOOK, "little in common (0.35 of"),
         ({"information": math.nan}, LOOK, "little in common (– of"),
-        ({"information": 0.1}, BAD, "do not fit"),
+        ({"information": 0.1, "information_before": 0.1}, LOOK, "do not fit"),  # two contrasts
+        ({"information": 0.1, "structure_before": 0.1}, BAD, "do not fit"),
         ({"correlation": 0.6}, LOOK, "hardly correlates (0.6;"),
         ({"disagreement": 0.3}, LOOK, "another one is found for 30%"),
         ({"extreme_inside": 0.2, "extreme": 0.1}, LOOK, "20% of what has contrast, 10% of all voxels"),
-        ({"disagreement": 0.3, "extreme_inside": 0.2, "correlation": 0.6}, BAD, "do not fit"),
+        ({"disagreement": 0.3, "extreme_inside": 0.2, "correlation": 0.6, "structure_before": 0.1}, BAD, "do not fit"),
         ({"information_before": 0.8}, LOOK, "less alike (information 0.8 → 0.7)"),
         ({"information_before": 0.95}, BAD, "less alike (information 0.95 → 0.7)"),
         ({"covered": 0.5}, LOOK, "covers only a part of the fixed one (50%"),
@@ -66,20 +67,27 @@ def test_the_images_and_the_map_are_judged(fine_evidence, change, kind, words):
         (labels(([0.5], 4.0), ([math.nan], math.inf)), GOOD, "images fit"),
         (labels(([0.5, 0.6], 4.0), ([0.9, 0.5], 3.0)), LOOK, "1 worse, most of all label 2: 0.6 → 0.5"),
         (labels(([0.5, 0.6, 0.6], 4.0), ([0.9, 0.5, 0.7], 3.0)), GOOD, "2 of 3 better, 1 worse"),
-        (labels(([0.5], 4.0), ([0.7], 6.0)), LOOK, "(95 % Hausdorff distance 4 → 6 µm"),
+        (labels(([0.5], 4.0), ([0.7], 6.0)), LOOK, "(95 % Hausdorff distance 4 → 6 px"),
         (labels(([0.75], 2.0), ([0.7], 4.0), ([0.76], 2.0)), LOOK, "alignment lowered the overlap of the labels"),
         (labels(([0.75], 2.0), ([0.7], 4.0), ([0.9], 2.0)), GOOD, "better"),
-        (landmarks([2.0, 2.0, 2.0], [1.0, 0.5, 0.5]), GOOD, "mean distance 2 → 0.667 µm; 0 of 3 farther apart"),
+        (landmarks([2.0, 2.0, 2.0], [1.0, 0.5, 0.5]), GOOD, "mean distance 2 → 0.667 px; 0 of 3 farther apart"),
         (landmarks([1.0], [1.0]), GOOD, "no nearer"),
         (landmarks([1.0], [2.0]), BAD, "farther apart than before"),
-        (landmarks([30.0], [20.0]), BAD, "far apart (mean distance 30 → 20 µm): are they the same points?"),
+        (landmarks([30.0], [20.0]), BAD, "far apart (mean distance 30 → 20 px): are they the same points?"),
         (landmarks([3.0, 0.0], [0.1, 1.5]), LOOK, "1 of 2 farther apart"),
     ],
 )
 def test_labels_and_landmarks_are_judged_one_by_one(fine_evidence, evaluation, kind, words):
-    verdict = judge(fine_evidence, GRID, folds=0, evaluation=evaluation, unit="µm")
+    verdict = judge(fine_evidence, GRID, folds=0, evaluation=evaluation)
     assert verdict.kind == kind
     assert any(words in finding.text for finding in verdict.findings)
+
+
+def test_distances_are_in_the_unit_of_the_file(fine_evidence):
+    """Coordinates are in mm also where lengths are shown in µm."""
+    small = Grid((40, 50), (0.001, 0.001))
+    verdict = judge(fine_evidence, small, folds=0, evaluation=landmarks([0.004], [0.002]), unit="µm")
+    assert "mean distance 4 → 2 µm" in verdict.findings[-1].text
 
 
 def test_folds_are_bad_and_counted(fine_evidence):
@@ -99,14 +107,14 @@ def test_a_warning_is_a_reason_to_look(fine_evidence):
     assert (verdict.kind, verdict.headline) == (LOOK, "Look closely before you use this: a.png is odd; see to it.")
 
 
-def test_a_mirror_image_is_bad_where_the_images_do_not_fit_either(fine_evidence):
-    assert judge(fine_evidence, GRID, folds=0, mirror=1.5).kind == LOOK
-    assert judge(replace(fine_evidence, disagreement=0.3), GRID, folds=0, mirror=1.5).kind == BAD
-    assert judge(fine_evidence, GRID, folds=0, mirror=1.1).kind == GOOD
+def test_a_mirror_image_is_named_by_how_much_better_it_would_fit(fine_evidence):
+    for mirror, kind in ((1.05, GOOD), (1.15, LOOK), (1.5, BAD)):
+        assert judge(fine_evidence, GRID, folds=0, mirror=mirror).kind == kind
 
 
 def test_labels_that_fit_outweigh_images_that_cannot_be_compared(fine_evidence):
-    unlike = replace(fine_evidence, information=0.05, correlation=0.2, information_before=0.05, correlation_before=0.2)
+    apart = {"information": 0.05, "correlation": 0.2, "information_before": 0.05, "correlation_before": 0.2}
+    unlike = replace(fine_evidence, **apart, structure_before=0.1)
     better, same = (labels(([0.7], 4.0), ([end], 4.0)) for end in (0.85, 0.705))
     assert judge(unlike, GRID, folds=0).kind == BAD
     assert judge(unlike, GRID, folds=0, evaluation=better).kind == LOOK

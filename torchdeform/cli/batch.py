@@ -84,7 +84,7 @@ def outcome(summary: Summary) -> str:
     judged = [f"{summary.badges[kind]} {BADGES[kind][1]}" for kind in VERDICTS if summary.badges.get(kind)]
     if judged:
         lines["verdict"] = ", ".join(judged)
-    lines |= {f"{title}, mean": text for title, text in summary.means.items()}
+    lines |= {f"{title}, mean": text.replace("→", "->") for title, text in summary.means.items()}
     if summary.failed:
         lines["failures"] = str(summary.out / FAILURES)
     return table(lines | {"results": str(summary.out / PAGE)})

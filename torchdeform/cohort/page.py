@@ -27,13 +27,15 @@ class Measure:
         title: its name.
         columns: of the summary: what it was before and what it is, or its smallest and largest value.
         worse: of each column, which values are the worse ones: 1 the large, −1 the small, 0 no matter.
-        between: text between two columns.
+        parts: what two columns are.
+        between: text between them.
         unit: of its values.
     """
 
     title: str
     columns: tuple[str, ...]
     worse: tuple[int, ...]
+    parts: tuple[str, str] = ("before", "after")
     between: str = " → "
     unit: str = ""
 
@@ -43,8 +45,8 @@ MEASURES = (
     Measure("Dice", ("dice_before", "dice_after"), (0, -1)),
     Measure("landmark error", ("landmark_error_before", "landmark_error_after"), (0, 1)),
     Measure("folds", ("folds",), (1,)),
-    Measure("determinant", ("determinant_min", "determinant_max"), (-1, 1), " to "),
-    Measure("inverse error", ("inverse_error_mean", "inverse_error_max"), (1, 1), ", at most ", "voxel"),
+    Measure("determinant", ("determinant_min", "determinant_max"), (-1, 1), ("smallest", "largest"), " to "),
+    Measure("inverse error", ("inverse_error_mean", "inverse_error_max"), (0, 1), ("mean", "largest"), " / ", "voxel"),
     Measure("time", ("seconds",), (1,), unit="s"),
     Measure("memory", ("peak_memory_mb",), (1,), unit="MB"),
     Measure("GPU memory", ("gpu_memory_mb",), (1,), unit="MB"),
@@ -143,7 +145,8 @@ def _strip(measure: Measure, rows: Sequence[Row], links: Mapping[str, str]) -> d
     marks = [(o.x, o.y, f"{o.name}: {_digits(o.value)}", links[o.name]) for o in strip.outliers]
     return {
         "title": _title(measure, rows),
-        "parts": measure.between.strip(" ,") if len(columns) > 1 else "",
+        "parts": measure.parts if len(columns) > 1 else (),
+        "log": strip.log,
         "low": _digits(strip.low),
         "high": _digits(strip.high),
         "height": strip.height,
@@ -167,8 +170,9 @@ def _measured(rows: Sequence[Row]) -> list[Measure]:
 
 
 def _values(rows: Sequence[Row], column: str) -> dict[str, float]:
-    """Return the values of a column by pair, those that are known and finite."""
-    return {str(row["name"]): value for row in rows if (value := _number(row, column)) is not None}
+    """Return the values of a column by pair, of those that are done and have one."""
+    found = {str(row["name"]): _number(row, column) for row in rows if row["status"] == DONE}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def _number(row: Row, column: str) -> float | None:

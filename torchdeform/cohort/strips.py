@@ -1,7 +1,8 @@
 """Strips: one measure of all pairs as rows of dots, small enough for thousands of pairs, with its outliers by name."""
 
+import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import quantiles
 
@@ -9,6 +10,7 @@ WIDTH, ROW = 320, 34  # of a strip and of a row of dots, in units of the drawing
 _MARGIN, _DOT = 5.0, 4.0  # free space at either end, and the distance of neighbouring dots
 _MOST = 7  # dots above one another; more of them look the same
 _FEWEST, _FENCE = 5, 1.5  # pairs from which on there are outliers, and how far they are from the quartiles, in spreads
+_ORDERS = 20.0  # from which on a scale is logarithmic
 _NAMED, _MARKED = 3, 40  # outliers with their name, and with a mark of their own
 
 
@@ -24,11 +26,10 @@ class Outlier:
 
 @dataclass(frozen=True)
 class Line:
-    """A row of dots: their path, their median, the box from the first quartile to the third, and their height."""
+    """A row of dots: their path, the places of their quartiles, and their height."""
 
     dots: str
-    middle: float
-    box: tuple[float, float]
+    quartiles: tuple[float, float, float]
     y: float
 
 
@@ -40,6 +41,7 @@ class Strip:
         low: its smallest value, at the left end.
         high: its largest value, at the right end.
         height: of the drawing.
+        log: whether the scale is logarithmic.
         lines: a row of dots for each column.
         outliers: the worst come first.
         named: those of them whose names are written.
@@ -48,6 +50,7 @@ class Strip:
     low: float
     high: float
     height: int
+    log: bool
     lines: tuple[Line, ...]
     outliers: tuple[Outlier, ...]
 
@@ -66,23 +69,29 @@ def strip_of(columns: Sequence[Mapping[str, float]], worse: Sequence[int]) -> St
 
     Notes:
         Outliers are farther than 1.5 times the distance of the quartiles from the nearer quartile, as in a box plot.
+        Positive values of several orders of magnitude are drawn, and their quartiles taken, as logarithms.
     """
     every = [value for column in columns for value in column.values()]
     low, high = min(every), max(every)
-    scale = (WIDTH - 2 * _MARGIN) / (high - low) if high > low else 0.0
-
-    def place(value: float) -> float:
-        return round(_MARGIN + scale * (value - low), 1)
-
+    log = 0 < low * _ORDERS < high
+    place = _placement(low, high, log)
     lines, found = [], list[tuple[float, Outlier]]()
     for k, (column, sign) in enumerate(zip(columns, worse, strict=True)):
-        y, box = ROW * (k + 0.5), _quartiles(list(column.values()))
-        far = _outliers(column, box, sign)
-        found += [(how, Outlier(name, column[name], place(column[name]), y)) for name, how in far.items()]
-        dots = "".join(_dots((place(value) for name, value in column.items() if name not in far), y))
-        lines.append(Line(dots, place(box[1]), (place(box[0]), place(box[2])), y))
+        places = {name: place(value) for name, value in column.items()}
+        y, box = ROW * (k + 0.5), _quartiles(list(places.values()))
+        far = _outliers(places, box, sign)
+        found += [(how, Outlier(name, column[name], round(places[name], 1), y)) for name, how in far.items()]
+        dots = "".join(_dots((x for name, x in places.items() if name not in far), y))
+        lines.append(Line(dots, box, y))
     outliers = tuple(outlier for _, outlier in sorted(found, key=lambda pair: -pair[0]))
-    return Strip(low, high, ROW * len(columns), tuple(lines), outliers)
+    return Strip(low, high, ROW * len(columns), log, tuple(lines), outliers)
+
+
+def _placement(low: float, high: float, log: bool) -> Callable[[float], float]:
+    """Return the function that takes a value to its place along the strip."""
+    scaled = math.log if log else float
+    start, end = scaled(low), scaled(high)
+    return lambda value: _MARGIN + (WIDTH - 2 * _MARGIN) * (scaled(value) - start) / ((end - start) or 1.0)
 
 
 def _quartiles(values: Sequence[float]) -> tuple[float, float, float]:

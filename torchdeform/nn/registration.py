@@ -8,7 +8,6 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import AUTO
 from torchdeform.core.warp import warp
 from torchdeform.errors import require_choice, require_ranges
 from torchdeform.metrics.similarity import INTENSITIES, MEASURES
@@ -44,7 +43,7 @@ class DeformableRegistration(nn.Module):
         settings = settings or RegistrationSettings()
         # Others compare features, which are warped in place of the image.
         measures = [name for name, measure in MEASURES.items() if measure.features is INTENSITIES]
-        settings = settings.with_similarity("lncc") if settings.similarity.measure == AUTO else settings
+        settings = settings.decided()
         require_choice(settings.similarity.measure, measures, "DeformableRegistration: similarity")
         self.grid, self.steps, self.settings = grid, steps, settings
         require_ranges(self, "DeformableRegistration: ", steps="at least 1")

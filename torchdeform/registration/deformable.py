@@ -22,7 +22,7 @@ from torchdeform.registration.agreement import disagreement
 from torchdeform.registration.discrete import discrete_start
 from torchdeform.registration.evidence import gather_evidence, to_compare, with_labels
 from torchdeform.registration.optimise import best_map, common_mask, forward_objective, optimise_levels
-from torchdeform.registration.placement import Placement, choose, place, problem_at
+from torchdeform.registration.placement import Placement, place, problem_at
 from torchdeform.registration.problem import (
     Annotations,
     PlacedImage,
@@ -105,7 +105,7 @@ def _register_tensors(
     grid = _checked_grid(fixed, moving, annotations)
     problem = problem_of_tensors(fixed, moving, grid, annotations)
     require_finite(problem.fixed, problem.moving, "register")
-    settings, choice = choose(problem, settings)
+    settings = settings.decided()  # items of a batch may not choose for each other
     problem = problem.scaled(settings)
     space = midspace_of_tensors(problem) if settings.symmetric else None
     found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
@@ -113,7 +113,7 @@ def _register_tensors(
     with limit_threads(len(found.u), grid):
         warped = warp(moving, found.u, grid)
         evaluation = evaluate_tensors(found.u, grid, labels=annotations.labels, points=annotations.points)
-    result = replace(_result(found, grid, warped, settings), evaluation=evaluation, choice=choice)
+    result = replace(_result(found, grid, warped, settings), evaluation=evaluation)
     return _examined(result, compared, (fixed, moving), annotations.labels)
 
 
@@ -175,7 +175,7 @@ def _register_images(
         affine=affine,
         alignment=alignment,
         warnings=alignment.warnings if alignment else (),
-        unit="mm",
+        unit=fixed.unit,
         choice=placed.choice,
         similarity_before=result.similarity_before if placed.unaligned is None else placed.unaligned,
         similarity_aligned=result.similarity_before if alignment else None,

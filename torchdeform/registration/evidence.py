@@ -1,7 +1,7 @@
 """Evidence of how well a registration went, in numbers that mean the same for every pair of images."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, product
@@ -14,6 +14,7 @@ from torchdeform.core.grid import Grid, limit_threads
 from torchdeform.core.resampling import box_sum, prolong, restrict, with_spacing
 from torchdeform.core.warp import sample, voxels, warp
 from torchdeform.metrics.correlation import contrast, lncc
+from torchdeform.metrics.mind import mind_ssc
 from torchdeform.registration.problem import RegistrationProblem
 
 # Nodes at most of the two grids that images are looked at on: one shows whether they show the same, the other where
@@ -49,6 +50,8 @@ class Evidence:
         information_before: normalised mutual information, whatever the contrast: 0 is what both images have when one
             is pushed aside, 1 what the fixed image has with itself; before the deformation.
         information: the same after the deformation.
+        structure_before: likeness of the patches around edges, whatever the contrast: 0 is what both images have when
+            one is pushed aside, 1 for equal images; before the deformation, on a finer grid.
         edges_before: mean distance of the fixed image's strong edges from those of the moving one, in voxels of the
             fixed image, before the deformation.
         edges: the same after the deformation.
@@ -71,6 +74,7 @@ class Evidence:
     correlation: float
     information_before: float
     information: float
+    structure_before: float
     edges_before: float
     edges: float
     foreground_before: float
@@ -160,6 +164,7 @@ def _of_item(
         correlation=after.correlation(),
         information_before=before.information(),
         information=after.information(),
+        structure_before=start.structure(),
         edges_before=size * start.edge_distance(),
         edges=size * end.edge_distance(),
         foreground_before=start.foreground_overlap(),
@@ -236,6 +241,17 @@ class Views:
         """Return the mutual information, from 0 for images pushed apart to 1 for the fixed image twice."""
         return self._informations((self,))[0]
 
+    def structure(self) -> float:
+        """Return 1 - D / (D of images pushed apart), D being the squared difference of their MIND features."""
+        views = replace(self, fixed=mind_ssc(self.fixed), moving=mind_ssc(self.moving))
+        away = [view._difference() for view in views.pushed()]
+        return 1 - views._difference() / max(sum(away) / len(away), _TINY)
+
+    def _difference(self) -> float:
+        apart = (self.fixed - self.moving).square().mean(1, keepdim=True)
+        weight = self.seen * self.both
+        return float((apart * weight).sum() / weight.sum().clamp(min=_TINY))
+
     def turned(self) -> tuple[str, ...]:
         """Return the axes along which turning the moving image over makes it fit clearly better."""
         names = dict(zip(self.grid.axes, "zyx"[-self.grid.dim :], strict=True))
@@ -245,10 +261,13 @@ class Views:
         return tuple(names[axis] for axis in ways[best]) if values[best] > values[0] + _BETTER else ()
 
     def _informations(self, views: Sequence["Views"]) -> list[float]:
-        pushes = (partial(_rolled, axis=axis, share=share) for axis, share in product(self.grid.axes, _AWAY))
-        away = [self._moved(push)._mutual() for push in pushes]
+        away = [view._mutual() for view in self.pushed()]
         least, most = sum(away) / len(away), replace(self, moving=self.fixed)._mutual()
         return [(view._mutual() - least) / max(most - least, _LEAST) for view in views]
+
+    def pushed(self) -> Iterator["Views"]:
+        for axis, share in product(self.grid.axes, _AWAY):
+            yield self._moved(partial(_rolled, axis=axis, share=share))
 
     def _moved(self, move: Callable[[Tensor], Tensor]) -> "Views":
         return replace(self, moving=move(self.moving), moving_weight=move(self.moving_weight))

@@ -120,12 +120,12 @@ def choose(problem: RegistrationProblem, settings: RegistrationSettings) -> tupl
         sign, and ``mind`` with a discrete start where they change their sign from place to place.
     """
     if settings.similarity.measure != AUTO:
-        return settings.with_similarity(settings.similarity.measure), None
+        return settings.decided(), None
     agreement = sign_agreement(problem.scaled(settings))
     measure = "lncc" if agreement >= _ONE_CONTRAST else "mind"
     kind = "one contrast" if measure == "lncc" else "different contrasts"
     sentence = f"similarity {measure}: the images have {kind} (local correlations of one sign: {agreement:.0%})"
-    return settings.with_similarity(measure), sentence
+    return settings.decided(measure), sentence
 
 
 def sign_agreement(problem: RegistrationProblem) -> float:

@@ -20,12 +20,12 @@ class SimilaritySettings:
     """What is compared, and how.
 
     Args:
-        measure: ``auto`` looks at the images and takes ``lncc`` where they have one contrast and ``mind`` where they do
-            not (``lncc`` in layers). For images of one contrast: ``lncc`` (squared local normalised cross-correlation,
-            whatever the brightness), ``ncc`` (the correlation of whole images), ``ssd`` (mean squared difference, for
-            images on the same intensity scale). For images of different contrast: ``mind`` (self-similarity of
-            patches), ``mi`` and ``nmi`` (mutual information, normalised), ``ngf`` (directions of the gradients). Or
-            several of them with positive weights, as ``{lncc: 1, mi: 0.5}``.
+        measure: ``auto`` looks at two `Image`s and takes ``lncc`` where they have one contrast and ``mind`` where they
+            do not (always ``lncc`` for tensors, whose batches may differ). For images of one contrast: ``lncc``
+            (squared local normalised cross-correlation, whatever the brightness), ``ncc`` (the correlation of whole
+            images), ``ssd`` (mean squared difference, for images on the same intensity scale). For images of different
+            contrast: ``mind`` (self-similarity of patches), ``mi`` and ``nmi`` (mutual information, normalised),
+            ``ngf`` (directions of the gradients). Or several of them with positive weights, as ``{lncc: 1, mi: 0.5}``.
         window: width of the LNCC window in voxels, odd.
 
     Raises:
@@ -252,7 +252,9 @@ class RegistrationSettings:
         """Whether the map to begin with is searched for."""
         return self.start == "discrete" or (self.start == AUTO and self.similarity.measure == "mind")
 
-    def with_similarity(self, measure: str | Mapping[str, float]) -> "RegistrationSettings":
-        """Return the same with this measure, and the start that goes with it in place of ``auto``."""
-        chosen = replace(self, similarity=replace(self.similarity, measure=measure))
+    def decided(self, measure: str = "lncc") -> "RegistrationSettings":
+        """Return the same with this measure in place of ``auto``, and with the start that goes with it."""
+        similarity = self.similarity
+        similarity = replace(similarity, measure=measure) if similarity.measure == AUTO else similarity
+        chosen = replace(self, similarity=similarity)
         return replace(chosen, start="discrete" if chosen.starts_discretely else "identity")

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
+from torchdeform.core.image import UNITS
 from torchdeform.metrics.evaluation import Evaluation
 from torchdeform.registration.evidence import Evidence
 
@@ -28,7 +29,8 @@ _SIGNS = 3  # so many of the four signs that images do not belong together are e
 _LOST, _SPOILT = 0.05, 0.2  # loss of correlation or information by the deformation: look, bad
 _INVERSE = 0.5  # voxels
 _ABSENT = 0.05
-_MIRROR = 1.2  # merit of a mirrored alignment over the best one
+_STRUCTURE = 0.27  # (two contrasts of one thing 0.32; unrelated pictures 0.13, another organ 0.23)
+_MIRROR, _MIRRORED = 1.1, 1.2  # merit of a mirrored alignment over the best one: look, bad (good pairs 1.05)
 
 _SEEN, _UNSEEN = 0.2, 0.4  # contrast of labels in one image, and share of it in the other, from which on they differ
 _STEADY = 0.01  # a change of Dice, or of a distance relative to it, that does not count
@@ -83,7 +85,7 @@ def judge(
     evaluation: Evaluation | None = None,
     mirror: float = 0.0,
     warnings: Sequence[str] = (),
-    unit: str = "mm",
+    unit: str = "px",
 ) -> Verdict:
     """Return the verdict on one pair.
 
@@ -94,7 +96,7 @@ def judge(
         evaluation: what labels and landmarks say, of one item.
         mirror: merit of the best mirrored alignment over that of the best one, 0 if unknown.
         warnings: sentences about what looks wrong with the input.
-        unit: what lengths of the grid are in.
+        unit: what lengths are shown in, one of `UNITS`.
 
     Notes:
         No figure proves that the right tissue is on the right tissue. Only labels, landmarks or a look can show it.
@@ -134,11 +136,12 @@ def _images(evidence: Evidence, mirror: float) -> Iterator[Finding]:
     unlike = evidence.information < _NO_INFORMATION or len(signs) >= _SIGNS
     if unlike:
         text = "The images do not fit (they may not show the same, or the registration failed)."
-        yield Finding(BAD, text, {"signs": len(signs)})
+        kind = LOOK if evidence.structure_before > _STRUCTURE else BAD  # two contrasts are hard to compare
+        yield Finding(kind, text, {"signs": len(signs), "structure_before": evidence.structure_before})
     if mirror > _MIRROR:
         text = "The moving image looks like a mirror image of the fixed one (mirrored it would fit "
         text += f"{number(mirror)} times as well)."
-        yield Finding(BAD if signs else LOOK, text, {"mirror": mirror})
+        yield Finding(BAD if mirror > _MIRRORED else LOOK, text, {"mirror": mirror})
     if evidence.turned:
         axes = " and ".join(evidence.turned)
         yield Finding(BAD, f"The moving image would fit much better turned over along {axes}.")
@@ -268,8 +271,8 @@ def _each_label(evaluation: Evaluation, means: str, figures: dict[str, float], b
 
 def _surfaces(evaluation: Evaluation, grid: Grid, unit: str) -> Iterator[Finding]:
     """Whether the surfaces of labels moved apart."""
-    before, after = (_mean(stage.hausdorff) for stage in (evaluation.before, evaluation.after))
-    if after > before + min(grid.spacing) and after > 1.1 * before:
+    before, after = (_mean(stage.hausdorff) * UNITS[unit] for stage in (evaluation.before, evaluation.after))
+    if after > before + min(grid.spacing) * UNITS[unit] and after > 1.1 * before:
         text = f"The surfaces of the labels are farther apart than before (95 % Hausdorff distance {number(before)} → "
         yield Finding(
             LOOK,
@@ -281,19 +284,17 @@ def _surfaces(evaluation: Evaluation, grid: Grid, unit: str) -> Iterator[Finding
 def _landmarks(first: Tensor, last: Tensor, grid: Grid, unit: str) -> Iterator[Finding]:
     """How the distances of landmarks changed, on average and of each."""
     before, after, voxel = float(first.mean()), float(last.mean()), min(grid.spacing)
-    worse, far = int((last > first + voxel).sum()), float(last.median()) / math.hypot(*grid.extent)
-    ends = f"mean distance {number(before)} → {number(after)} {unit}"
-    figures = {"landmark_error_before": before, "landmark_error_after": after, "worse": worse}
-    if far > _FAR:
+    worse, scale = int((last > first + voxel).sum()), UNITS[unit]
+    ends = f"mean distance {number(before * scale)} → {number(after * scale)} {unit}"
+    figures = {"landmark_error_before": before * scale, "landmark_error_after": after * scale, "worse": worse}
+    if float(last.median()) > _FAR * math.hypot(*grid.extent):
         yield Finding(BAD, f"The landmarks are far apart ({ends}): are they the same points?", figures)
     elif after > before * (1 + _STEADY) + _STEADY * voxel:
         yield Finding(BAD, f"The landmarks are farther apart than before ({ends}).", figures)
     else:
-        kind = GOOD if worse <= _WORSE * last.numel() else LOOK
         words = "nearer" if after < before * (1 - _STEADY) else "no nearer"
-        yield Finding(
-            kind, f"The landmarks are {words} than before ({ends}; {worse} of {last.numel()} farther apart).", figures
-        )
+        text = f"The landmarks are {words} than before ({ends}; {worse} of {last.numel()} farther apart)."
+        yield Finding(GOOD if worse <= _WORSE * last.numel() else LOOK, text, figures)
 
 
 def _mean(values: Tensor) -> float:
