@@ -8,6 +8,7 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.warp import warp
 from torchdeform.registration.agreement import disagreement
 from torchdeform.registration.problem import RegistrationProblem
+from torchdeform.registration.settings import RegistrationSettings
 
 
 def texture(seed: int, *shape: int) -> Tensor:
@@ -23,7 +24,7 @@ def test_maps_of_one_scene_agree_and_those_of_two_do_not(shape, make_displacemen
     fixed = texture(0, *shape)
     moved = warp(fixed, make_displacement(grid, 0.05), grid)
     pair = RegistrationProblem(grid, torch.cat([fixed, fixed, fixed]), torch.cat([fixed, moved, texture(7, *shape)]))
-    same, near, other = disagreement(pair).tolist()
+    same, near, other = disagreement(pair, RegistrationSettings()).tolist()
     assert same == 0
     assert near < 0.05
     assert other > 0.2
@@ -35,8 +36,8 @@ def test_masks_go_along():
     mask = torch.zeros_like(fixed)
     mask[..., :20] = 1
     mixed = torch.where(mask > 0, fixed, other)
-    assert float(disagreement(RegistrationProblem(grid, fixed, mixed, mask, mask))) < 0.05
-    assert float(disagreement(RegistrationProblem(grid, fixed, mixed))) > 0.05
+    assert float(disagreement(RegistrationProblem(grid, fixed, mixed, mask, mask), RegistrationSettings())) < 0.05
+    assert float(disagreement(RegistrationProblem(grid, fixed, mixed), RegistrationSettings())) > 0.05
 
 
 def test_what_lies_outside_of_a_mask_has_no_influence():
@@ -45,7 +46,10 @@ def test_what_lies_outside_of_a_mask_has_no_influence():
     mask = torch.zeros_like(fixed)
     mask[..., :20] = 1
     found = [
-        disagreement(RegistrationProblem(grid, fixed, torch.where(mask > 0, fixed, other), moving_mask=mask))
+        disagreement(
+            RegistrationProblem(grid, fixed, torch.where(mask > 0, fixed, other), moving_mask=mask),
+            RegistrationSettings(),
+        )
         for other in (fixed, fixed.mean().expand_as(fixed))
     ]
     assert torch.allclose(found[0], found[1], atol=0.02)

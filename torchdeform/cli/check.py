@@ -8,12 +8,15 @@ import typer
 
 from torchdeform.cli.options import FixedMask, Json, MovingMask, choice, print_json
 from torchdeform.core.image import Image, is_oblique, orientation
-from torchdeform.errors import InputError, require_choice
+from torchdeform.errors import InputError, TorchdeformError, require_choice
 from torchdeform.io import read_image
 from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.io.images import read_optional
+from torchdeform.pipeline.config import load_settings
 from torchdeform.pipeline.preflight import ERROR, Finding, preflight
 from torchdeform.registration.affine.settings import ALIGNMENTS
+from torchdeform.registration.placement import place
+from torchdeform.registration.problem import Annotations
 from torchdeform.report.figures import write_overlay
 
 Fixed = Annotated[
@@ -46,26 +49,44 @@ def check(
     images = read_image(fixed), read_image(moving)
     masks = read_optional(fixed_mask), read_optional(moving_mask)
     report = preflight(*images, fixed_mask=masks[0], moving_mask=masks[1], aligned=align != "none")
+    predicted = None if report.of(ERROR) else _predicted(*images, *masks, align)
     drawn = _draw(out, *images) if out is not None else None
-    (_print_json if json else _print_text)(images, report.findings, drawn)
+    (_print_json if json else _print_text)(images, report.findings, predicted, drawn)
     if report.of(ERROR):
         raise typer.Exit(2)
 
 
-def _print_text(images: tuple[Image, Image], findings: Sequence[Finding], picture: Path | None) -> None:
+def _predicted(
+    fixed: Image, moving: Image, fixed_mask: Image | None, moving_mask: Image | None, align: str
+) -> str | None:
+    """Return a sentence on the similarity that `register` will choose, or on why it cannot begin."""
+    settings = load_settings("default", overrides={"align.kind": align})
+    try:
+        return place(fixed, moving, settings, Annotations(fixed_mask=fixed_mask, moving_mask=moving_mask)).choice
+    except TorchdeformError as error:
+        return str(error)
+
+
+def _print_text(
+    images: tuple[Image, Image], findings: Sequence[Finding], predicted: str | None, picture: Path | None
+) -> None:
     typer.echo(side_by_side(*images))
     for finding in findings:
         typer.echo(f"{finding.severity}: {finding.text}")
     if not findings:
         typer.echo("nothing looks wrong")
+    if predicted is not None:
+        typer.echo(f"register will choose: {predicted}")
     if picture is not None:
         typer.echo(f"picture: {picture}")
 
 
-def _print_json(images: tuple[Image, Image], findings: Sequence[Finding], picture: Path | None) -> None:
+def _print_json(
+    images: tuple[Image, Image], findings: Sequence[Finding], predicted: str | None, picture: Path | None
+) -> None:
     properties = {side: _properties(image) for side, image in zip(("fixed", "moving"), images, strict=True)}
     found = [{"severity": finding.severity, "text": finding.text} for finding in findings]
-    print_json({**properties, "findings": found, "picture": picture})
+    print_json({**properties, "findings": found, "predicted": predicted, "picture": picture})
 
 
 def side_by_side(fixed: Image, moving: Image) -> str:

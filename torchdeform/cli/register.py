@@ -131,8 +131,10 @@ def register(
 def summary(outcome: Outcome) -> str:
     """Return the verdict and the most important figures of a registration in a few lines."""
     r = outcome.record
+    stages = (r[f"similarity_{stage}"] for stage in ("before", "aligned", "after"))
+    marks = [f"{mark:.2f}" for mark in stages if mark is not None]
     lines = {
-        f"similarity ({measure_name(r['similarity'])})": f"{r['similarity_before']:.4g} -> {r['similarity_after']:.4g}",
+        f"similarity ({measure_name(r['similarity'])})": f"{' -> '.join(marks)} (1: the same)",
         "folds": folds_text(r),
         "inverse consistency": inverse_text(r["inverse_error_mean"], r["inverse_error_max"]),
         **_measured(r),

@@ -193,6 +193,7 @@ def register_files(
         ComputationError: the registration failed. Nothing is written then.
     """
     from torchdeform.registration.deformable import register
+    from torchdeform.registration.placement import place
 
     where, start = choose_device(device), perf_counter()
     require_choice(report, REPORTS, "report")
@@ -204,7 +205,10 @@ def register_files(
     fixed, notes = _fit_to_memory(inputs.fixed, settings, memory, where)
     run = _Run(memory, {"read": perf_counter() - start}, {"read": peak()})
     moving, annotations = inputs.moving.to(where), inputs.annotations.to(where)
-    result = register(fixed.to(where), moving, settings, annotations=annotations, callback=callback)
+    placed = place(fixed.to(where), moving, settings, annotations)
+    if placed.choice:  # what was chosen may take more
+        fixed, notes = _fit_to_memory(inputs.fixed, placed.settings, memory, where)
+    result = register(fixed.to(where), moving, settings, annotations=annotations, affine=placed, callback=callback)
     if fixed is not inputs.fixed:  # a coarser grid was registered
         result = resample_result(result, inputs.fixed.to(where), moving, annotations)
     _require_finite(result)

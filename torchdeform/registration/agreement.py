@@ -1,5 +1,7 @@
 """Whether two images are registered alike in both directions, each found without the other."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -14,18 +16,18 @@ from torchdeform.registration.settings import OptimiserSettings, RegistrationSet
 _AGREE = 1.0
 
 _SETTINGS = RegistrationSettings(
-    align="none",
     similarity=SimilaritySettings(measure="lncc", window=7),
     optimiser=OptimiserSettings(steps=(10,), step_length=2.0),  # 25 steps of 1 tell no more
 )
 
 
 @torch.no_grad()
-def disagreement(problem: RegistrationProblem) -> Tensor:
+def disagreement(problem: RegistrationProblem, settings: RegistrationSettings) -> Tensor:
     """Return the share of what has contrast where rough maps there and back miss each other by more than a voxel.
 
     Args:
         problem: two images of one channel, see `to_compare`.
+        settings: by which solver, flow and stencil.
 
     Returns:
         ``(B,)`` from 0 to 1.
@@ -38,7 +40,8 @@ def disagreement(problem: RegistrationProblem) -> Tensor:
     grid = Grid(rough.grid.shape)  # in voxels
     both = RegistrationProblem(grid, *_there_and_back(rough.fixed, rough.moving), *_masks(rough))
     with limit_threads(1, grid):
-        there, back = optimise_levels(both, _SETTINGS, None, None)[0].chunk(2)
+        quick = replace(_SETTINGS, solver=settings.solver, flow=settings.flow, stencil=settings.stencil)
+        there, back = optimise_levels(both, quick, None, None)[0].chunk(2)
         apart = (there + warp(back, there, grid)).norm(dim=1, keepdim=True)
         far = (apart > _AGREE).to(apart)
     seen = Views.of(rough).seen

@@ -126,7 +126,7 @@ def _examined(
     """Return the result with its evidence, from images on a grid of few nodes, and labels on the images' own grids."""
     began = perf_counter()
     maps = (result.displacement, result.inverse, result.grid)
-    evidence = gather_evidence(compared, *maps, disagreement=disagreement(compared))
+    evidence = gather_evidence(compared, *maps, disagreement=disagreement(compared, result.settings))
     if labels is not None:
         evidence = with_labels(evidence, images, labels)
     return replace(result, evidence=evidence, seconds=result.seconds | {"judge": perf_counter() - began})
