@@ -88,3 +88,18 @@ def test_two_contrasts_are_compared_by_their_edges(make_image, make_result, dim)
     found = worst_place(PairSampler(fixed, moving, result, Annotations()), None, None, alike=False)
     assert found.node == pytest.approx(spot, abs=6)
     assert found.reason == "the edges differ most here"
+
+
+def test_what_the_moving_image_does_not_show_is_not_the_worst_place(make_image, make_result):
+    """Labels beyond it have no partner, which says nothing about the registration."""
+    fixed = make_image((40, 60))
+    label = torch.zeros_like(fixed.data)
+    label[..., 25:40, 35:60] = 1.0
+    label[..., 5:9, 5:9] = 1.0
+    half = replace(fixed, data=fixed.data[..., :30], grid=Grid((40, 30)))
+    still = torch.zeros(1, 2, 40, 60)
+    result = replace(make_result(fixed, half), displacement=still, inverse=still)
+    given = Annotations(fixed_labels=replace(fixed, data=label), moving_labels=replace(half, data=0 * half.data + 2))
+    given.moving_labels.data[..., 9:, :] = 0.0  # type: ignore[union-attr]
+    found = worst_place(PairSampler(fixed, half, result, given), None, None, alike=True)
+    assert found.node[1] < 30

@@ -67,7 +67,7 @@ def worst_place(sampler: PairSampler, landmarks: Landmarks | None, absent: Tenso
         alike: whether the images have one contrast, so that grey values can be compared; else their slopes are.
 
     Notes:
-        Labels and images are compared at some nodes, in a window of a tenth of the image.
+        Labels and images are compared at some nodes within the moving image, in a window of a tenth of the image.
     """
     if landmarks is not None:
         worst = int(landmarks.distances[WARPED].argmax())
@@ -79,7 +79,7 @@ def worst_place(sampler: PairSampler, landmarks: Landmarks | None, absent: Tenso
     points = grid.points()[some].to(sampler.u)
     fixed, warped = (sampler.at(image, points, lambda field: field[some]) for image in (FIXED, WARPED))
     if fixed.labels is not None and warped.labels is not None:
-        differ = (fixed.labels != warped.labels).float()
+        differ = ((fixed.labels != warped.labels) & warped.inside).float()
         return Place(_densest(differ, step, grid), "the labels differ most here")
     weight = warped.inside.float() if fixed.mask is None else (warped.inside & (fixed.mask != 0)).float()
     weight = weight if absent is None else weight * (1 - absent[some])
