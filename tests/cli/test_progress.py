@@ -55,13 +55,13 @@ def test_every_stage_of_a_registration_has_its_name_and_the_bar_grows(terminal, 
     steps = [Step(level, 3, step, 2, torch.tensor([0.5]), (30, 40)) for level in range(3) for step in (1, 2)]
     with StepProgress() as bar:
         seen = [_seen(bar)]
-        for stage in ("reading", "aligning", *steps, "inverting", "writing", "drawing"):
+        for stage in ("reading", "aligning", *steps, "inverting", "judging", "writing", "drawing"):
             begin(stage) if isinstance(stage, str) else bar.show(stage)
             seen.append(_seen(bar))
             bar._progress.refresh()
     titles, shares = zip(*seen, strict=True)
     assert list(dict.fromkeys(titles)) == [
-        "reading", "aligning", *(f"level {k}/3 30×40" for k in (1, 2, 3)), "inverting", "writing", "drawing"
+        "reading", "aligning", *(f"level {k}/3 30×40" for k in (1, 2, 3)), "inverting", "judging", "writing", "drawing"
     ]  # fmt: skip
     assert list(shares) == sorted(shares)
     assert shares[-1] < 1  # there is something to do until the end

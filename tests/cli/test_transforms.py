@@ -194,8 +194,8 @@ def test_jacobian(folder, capsys):
     det = chain.jacobian_determinant().data
     torch.testing.assert_close(read_image("det.nii.gz").data.double(), det, atol=1e-5, rtol=0)
     assert f"{float(det.max()):.3g}" in out
-    assert "folds                0" in out
-    assert "written              det.nii.gz" in out
+    assert "folds                  0" in out
+    assert "written                det.nii.gz" in out
     assert run("jacobian", "affine.mat", "--reference", "moving.nrrd", "--out", "a.nrrd", "--quiet") == 0
     affine = read_image("a.nrrd").data
     torch.testing.assert_close(affine, torch.full_like(affine, 1.05**chain.dim))

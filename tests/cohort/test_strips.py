@@ -29,10 +29,11 @@ def test_equal_values_are_dots_above_each_other():
 
 
 def test_values_of_many_magnitudes_have_a_logarithmic_scale():
-    strip = strip_of([{"a": 1e-4, "b": 1e-2, "c": 1.0}], [1])
+    strip = strip_of([{"a": 1e-4, "b": 1e-2, "c": 1.0}], [1], ratios=True)
     assert strip.log
     assert sorted(x for x, _ in places(strip.lines[0].dots)) == pytest.approx([5, WIDTH / 2, WIDTH - 5], abs=2)
-    assert not strip_of([{"a": 0.0, "b": 1e-2, "c": 1.0}], [1]).log
+    assert not strip_of([{"a": 0.0, "b": 1e-2, "c": 1.0}], [1], ratios=True).log
+    assert not strip_of([{"a": 1e-4, "b": 1e-2, "c": 1.0}], [1]).log
 
 
 @pytest.mark.parametrize("worse", [-1, 0, 1])

@@ -15,7 +15,8 @@ from torchdeform.core.transform import Affine
 from torchdeform.core.warp import sample, warp
 from torchdeform.errors import InputError
 from torchdeform.registration.deformable import register
-from torchdeform.registration.problem import Annotations, moved
+from torchdeform.registration.optimise import forward_similarity
+from torchdeform.registration.problem import Annotations, moved, placed_images, resample_pair
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
@@ -257,3 +258,20 @@ def test_starts_and_affine_maps_that_do_not_fit_are_named():
             register(*PAIR, QUICK, start=start)
     with pytest.raises(InputError, match="must be Images"):
         register(*PAIR, QUICK, affine=Affine.identity(2))
+
+
+@pytest.mark.parametrize("similarity", ["lncc", "ncc", "ssd", "mi"])
+def test_where_the_moving_image_does_not_reach_nothing_is_compared(similarity):
+    """Whatever the fixed image shows there, similarity and forces are the same; the map carries the end with it."""
+    grid = Grid((40, 44))
+    fixed, u = blobs(grid.shape) / 6, bend(grid, 3.0)
+    frame, moving = Image(fixed, grid), Image(blobs(grid.shape, 1)[..., :30] / 6, Grid((40, 30)))
+    problem = resample_pair(*placed_images(frame, moving, Annotations()), frame)
+    assert problem.moving_mask is not None
+    beyond = warp(problem.moving_mask, u, grid) == 0
+    other = replace(problem, fixed=torch.where(beyond, blobs(grid.shape, 2) / 6, fixed))
+    settings = settings_of(measure=similarity)
+    known, found = (forward_similarity(each, settings).evaluate(u)[1:] for each in (problem, other))
+    assert 0.2 < beyond.float().mean() < 0.5
+    torch.testing.assert_close(found, known)
+    assert known[1][beyond].abs().max() == 0

@@ -19,8 +19,11 @@ from torchdeform.registration.result import Progress as Step
 _STOPPED = 130  # exit code of a command that Ctrl-C ended, as shells have it
 
 # Where on the bar a stage of a registration begins; the levels lie between two of them.
-_STAGES = {"reading": 0.0, "aligning": 0.05, "searching": 0.2, "inverting": 0.85, "writing": 0.9, "drawing": 0.93}
-_LEVELS = (0.25, 0.85)
+_STAGES = {
+    "reading": 0.0, "aligning": 0.05, "searching": 0.2, "inverting": 0.8, "judging": 0.85, "writing": 0.9,
+    "drawing": 0.93,
+}  # fmt: skip
+_LEVELS = (0.25, 0.8)
 
 
 @contextmanager

@@ -38,7 +38,7 @@ _BAD_RESULT = 3  # exit code
 _PLAIN_MARKS = {GOOD: "OK", LOOK: "!", BAD: "X"}  # for terminals without Unicode
 _COLOURS = {GOOD: typer.colors.GREEN, LOOK: typer.colors.YELLOW, BAD: typer.colors.RED}
 
-Report = Annotated[str, choice(REPORTS, "Pictures: {}; light has the middle slices only.", "KIND")]
+Report = Annotated[str, choice(REPORTS, "Pictures: {}.", "KIND")]
 Overwrite = Annotated[bool, flag("--overwrite", "Replace results of another pair in the folder.")]
 Fixed = Annotated[
     Path,
@@ -57,7 +57,7 @@ Symmetric = Annotated[bool, flag("--symmetric", "Treat both images alike: swappi
 Memory = Annotated[
     str | None, typer.Option(metavar="SIZE", show_default="what is free", help="Use at most this, such as 4GB.")
 ]
-Preset = Annotated[str, choice(preset_names(), "Settings to start from: {}.", show_default=False)]
+Preset = Annotated[str, choice(preset_names(), "Start from {}.", show_default=False)]
 Config = Annotated[
     Path | None, typer.Option(metavar="FILE", help="YAML file with settings that differ from the preset.")
 ]

@@ -190,7 +190,7 @@ def jacobian(
     lines = {"determinant": f"{low:.3g} to {high:.3g}, {mean:.3g} on average"}
     if len(chain.stages) > 1:
         ranges = (f"{part['determinant_min']:.3g} to {part['determinant_max']:.3g}" for part in parts)
-        lines["without affine maps"] = " and ".join(ranges)
+        lines["without the alignment"] = " and ".join(ranges)
     say_written(out, lines | {"folds": f"{folds}"}, quiet=quiet)
 
 

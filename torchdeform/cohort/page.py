@@ -30,6 +30,7 @@ class Measure:
         parts: what two columns are.
         between: text between them.
         unit: of its values.
+        ratios: whether twice as much is as far as half as much.
     """
 
     title: str
@@ -38,6 +39,7 @@ class Measure:
     parts: tuple[str, str] = ("before", "after")
     between: str = " → "
     unit: str = ""
+    ratios: bool = False
 
 
 MEASURES = (
@@ -45,8 +47,12 @@ MEASURES = (
     Measure("Dice", ("dice_before", "dice_after"), (0, -1)),
     Measure("landmark error", ("landmark_error_before", "landmark_error_after"), (0, 1)),
     Measure("folds", ("folds",), (1,)),
-    Measure("determinant", ("determinant_min", "determinant_max"), (-1, 1), ("smallest", "largest"), " to "),
-    Measure("inverse error", ("inverse_error_mean", "inverse_error_max"), (0, 1), ("mean", "largest"), " / ", "voxel"),
+    Measure(
+        "determinant", ("determinant_min", "determinant_max"), (-1, 1), ("smallest", "largest"), " to ", ratios=True
+    ),
+    Measure(
+        "inverse error", ("inverse_error_mean", "inverse_error_max"), (0, 1), ("mean", "largest"), " / ", "voxel", True
+    ),
     Measure("time", ("seconds",), (1,), unit="s"),
     Measure("memory", ("peak_memory_mb",), (1,), unit="MB"),
     Measure("GPU memory", ("gpu_memory_mb",), (1,), unit="MB"),
@@ -140,7 +146,7 @@ def _shown(folder: Path, row: Row, known: Sequence[Measure], failure: Row) -> di
 def _strip(measure: Measure, rows: Sequence[Row], links: Mapping[str, str]) -> dict[str, Any]:
     """Return the strip of a measure with its title and its outliers as text."""
     columns = [(values, w) for c, w in zip(measure.columns, measure.worse, strict=True) if (values := _values(rows, c))]
-    strip = strip_of(*zip(*columns, strict=True))
+    strip = strip_of(*zip(*columns, strict=True), ratios=measure.ratios)
     named = [(outlier.name, _digits(outlier.value), links[outlier.name]) for outlier in strip.named]
     marks = [(o.x, o.y, f"{o.name}: {_digits(o.value)}", links[o.name]) for o in strip.outliers]
     return {

@@ -60,20 +60,20 @@ class Strip:
         return tuple({outlier.name: outlier for outlier in reversed(self.outliers)}.values())[::-1][:_NAMED]
 
 
-def strip_of(columns: Sequence[Mapping[str, float]], worse: Sequence[int]) -> Strip:
+def strip_of(columns: Sequence[Mapping[str, float]], worse: Sequence[int], *, ratios: bool = False) -> Strip:
     """Return the strip of a measure.
 
     Args:
         columns: its values by pair, before and after, say; none of them empty.
         worse: of each column, which values are the worse ones: 1 the large, −1 the small, 0 no matter.
+        ratios: draw positive values of several orders of magnitude, and take their quartiles, as logarithms.
 
     Notes:
         Outliers are farther than 1.5 times the distance of the quartiles from the nearer quartile, as in a box plot.
-        Positive values of several orders of magnitude are drawn, and their quartiles taken, as logarithms.
     """
     every = [value for column in columns for value in column.values()]
     low, high = min(every), max(every)
-    log = 0 < low * _ORDERS < high
+    log = ratios and 0 < low * _ORDERS < high
     place = _placement(low, high, log)
     lines, found = [], list[tuple[float, Outlier]]()
     for k, (column, sign) in enumerate(zip(columns, worse, strict=True)):

@@ -156,7 +156,7 @@ def surroundings(image: Image) -> Tensor:
     """
     data, flat = image.data, image.data.flatten(2)
     faces = torch.cat([data.select(axis, end).flatten(2) for axis in range(2, data.dim()) for end in (0, -1)], dim=2)
-    some = flat[..., :: 1 + flat.shape[2] // _SOME]
+    some = flat[..., :: 1 + flat.numel() // _SOME]
     faces, some = (torch.where(part.isfinite(), part, torch.nan) for part in (faces, some))
     low, high = some.nanquantile(torch.tensor(_ENDS).to(flat), dim=2, interpolation="lower")
     middle = faces.nanmedian(dim=2).values

@@ -48,7 +48,7 @@ def legend(data: ReportData) -> list[Entry]:
     entries += [
         _lines(MASKS, "masks", others),
         Entry(NO_DATA, "no data", [(EMPTY_COLOUR, "")], note="beyond the moving image"),
-        Entry(ABSENT, "let go", [(ABSENT_COLOUR, "")], note=_ABOUT_ABSENT),
+        Entry(ABSENT, "in the fixed image only", [(ABSENT_COLOUR, "")], note=_ABOUT_ABSENT),
         Entry(WORST, "worst place", [(WORST_COLOUR, "")], note=known.worst.reason),
     ]
     return [entry for entry in entries if entry.kind in kinds]
