@@ -3,7 +3,7 @@
 Usage: python scripts/benchmarks/verdict.py [DATA] [--only KIND ...]
 
 DATA is the folder of images, TORCHDEFORM_DATA or ../shared/data by default. Good pairs are judged with the labels and
-landmarks that they have, bad ones without, unless these are what is wrong. Pairs that the check refuses count as bad.
+landmarks that they have, bad ones without, unless these are what is wrong. Pairs that are refused with a sentence count as bad.
 Thresholds were chosen on the cases of the half "chosen on"; the other half had no say.
 """
 
@@ -36,7 +36,10 @@ def verdict_on(case: Case) -> Verdict:
     report = preflight(scene.fixed, scene.moving, aligned=settings.align.kind != "none", settings=settings, **masks)
     for refused in report.of(ERROR):
         return Verdict(BAD, refused, ())
-    result = td.register(scene.fixed, scene.moving, settings, annotations=known)
+    try:
+        result = td.register(scene.fixed, scene.moving, settings, annotations=known)
+    except td.InputError as refused:
+        return Verdict(BAD, str(refused), ())
     return replace(result, warnings=(*report.of(WARNING), *result.warnings)).verdict
 
 
