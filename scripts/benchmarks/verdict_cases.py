@@ -34,12 +34,12 @@ class Scene:
 
 @dataclass(frozen=True)
 class Case:
-    """A scene that is made when it is wanted. Half of the cases, ``tune``, may choose thresholds."""
+    """A scene that is made when it is wanted; every other case of a kind belongs to the first half."""
 
     kind: str
     name: str
     make: Callable[[], Scene]
-    tune: bool = True
+    first: bool = True
 
 
 def scene(pair: Pair, *, labels: bool = False, points: bool = False, masks: bool = True, **overrides: Any) -> Scene:

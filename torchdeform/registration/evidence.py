@@ -291,6 +291,8 @@ class Views:
         from scipy.ndimage import distance_transform_edt
 
         known = self.both > 0
+        if not bool(known.any()):
+            return math.inf
         edges = [_edges(image, known) for image in (self.fixed, self.moving)]
         if not all(bool(some.any()) for some in edges):
             return math.inf
@@ -300,6 +302,8 @@ class Views:
     def foreground_overlap(self) -> float:
         """Return the Dice overlap of what is brighter than Otsu's threshold, where both images are known."""
         known = self.both > 0
+        if not bool(known.any()):
+            return 0.0
         first, second = (image[known] > otsu(image[known]) for image in (self.fixed, self.moving))
         return float(2 * (first & second).sum() / (first.sum() + second.sum()).clamp(min=1))
 

@@ -16,8 +16,8 @@ _ORDER = (BAD, LOOK, GOOD)
 WARNED = "Warning: "  # how findings begin that repeat a warning about the input
 MARKS = {GOOD: "✓", LOOK: "!", BAD: "✗"}
 
-# Thresholds, from the half of the cases of `scripts/benchmarks/verdict.py` that may choose them. In brackets: the
-# worst of the good pairs of one contrast, and the best of the pairs that show something else.
+# Thresholds, about in the middle of the gaps between the good and the bad pairs of `scripts/benchmarks/verdict.py`. In
+# brackets: the worst of the good pairs of one contrast, and the best of the pairs that show something else.
 _INFORMATION = 0.48  # (0.53, 0.44)
 _NO_INFORMATION = 0.25  # less than this is what unrelated pictures reach (0.14)
 _CORRELATION = 0.68  # (0.74, 0.76; unrelated pictures 0.51)
@@ -34,7 +34,6 @@ _MIRROR, _MIRRORED = 1.1, 1.2  # merit of a mirrored alignment over the best one
 
 _SEEN, _UNSEEN = 0.2, 0.4  # contrast of labels in one image, and share of it in the other, from which on they differ
 _STEADY = 0.01  # a change of Dice, or of a distance relative to it, that does not count
-_DROP = 0.1  # a label that loses more overlap is named
 _WORSE = 1 / 3  # share of labels or landmarks that may get worse
 _APART, _FAR = 0.2, 0.05  # mean Dice, and landmark distance over the diagonal of the image, of what is not the same
 # Images are much more alike where they correlate by the first, and the second share of what was missing is gone. Labels
