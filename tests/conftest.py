@@ -110,10 +110,11 @@ def known_result(
     config: RegistrationSettings | None = None,
     *,
     annotations: Annotations | None = None,
+    affine: object = None,
     callback: Callback | None = None,
 ) -> RegistrationResult:
     """Answer like `torchdeform.register`, at once: the map is `smooth_displacement`, whatever the images."""
-    del annotations
+    del annotations, affine
     grid = fixed.grid
     u = smooth_displacement(grid)
     inverse = invert(u, grid)

@@ -14,32 +14,33 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 from verdict_cases import GOOD_PAIR, KINDS, Case, Cases
 
 import torchdeform as td
 from torchdeform.pipeline.preflight import ERROR, WARNING, preflight
-from torchdeform.registration.verdict import BAD, GOOD, LOOK
+from torchdeform.registration.verdict import BAD, GOOD, LOOK, Verdict
 
 VERDICTS = (GOOD, LOOK, BAD)
 # Kinds that must be bad, not only doubtful.
 MUST_BE_BAD = ("unrelated", "mirrored", "labels swapped", "overlap destroyed")
 
 
-def verdict_on(case: Case) -> td.Verdict:
+def verdict_on(case: Case) -> Verdict:
     """Return the verdict that `register` would print."""
     scene = case.make()
     settings = td.load_settings("default", None, scene.overrides)
     known = scene.annotations
-    masks = {"fixed_mask": known.fixed_mask, "moving_mask": known.moving_mask}
+    masks: dict[str, Any] = {"fixed_mask": known.fixed_mask, "moving_mask": known.moving_mask}
     report = preflight(scene.fixed, scene.moving, aligned=settings.align.kind != "none", settings=settings, **masks)
     for refused in report.of(ERROR):
-        return td.Verdict(BAD, refused, ())
+        return Verdict(BAD, refused, ())
     result = td.register(scene.fixed, scene.moving, settings, annotations=known)
     return replace(result, warnings=(*report.of(WARNING), *result.warnings)).verdict
 
 
-def misses(rows: Iterable[tuple[Case, td.Verdict]]) -> list[str]:
+def misses(rows: Iterable[tuple[Case, Verdict]]) -> list[str]:
     """Return a line for each good pair that is not good, and each bad one that is good or not as bad as it must be."""
     found = []
     for case, verdict in rows:
@@ -51,7 +52,7 @@ def misses(rows: Iterable[tuple[Case, td.Verdict]]) -> list[str]:
     return found
 
 
-def confusion(rows: list[tuple[Case, td.Verdict]]) -> list[str]:
+def confusion(rows: list[tuple[Case, Verdict]]) -> list[str]:
     """Return the table: kinds of pairs, and how many of each half are taken for good, look and bad."""
     counts = Counter((case.kind, case.tune, verdict.kind) for case, verdict in rows)
     kinds = [kind for kind in KINDS if any(name == kind for name, _, _ in counts)]

@@ -294,7 +294,7 @@ def _landmarks(cases: Cases) -> _Made:
 
 def _far(cases: Cases) -> _Made:
     places = (("heart_2d", 5, (45, 20)), ("mindboggle_2d", 6, (50, 10)), ("hippocampus_3d", 3, (12, 12, 8)))
-    places += (("lung_ct_3d", 0, (0, 0, 0)), ("histology_2d", 1, (70, 90)), ("spine_t1t2_3d", 0, (15, 10, 0)))
+    places += (("lung_ct_3d", 0, (70, 40, 0)), ("histology_2d", 1, (70, 90)), ("spine_t1t2_3d", 0, (15, 10, 0)))
     for name, index, move in places:
         pair = cases._pair(name, index)
         yield f"{name} {pair.name}", lambda p=pair, m=move: changed(p, shifted(*m), align="none")

@@ -41,7 +41,8 @@ def test_the_verb_shows_both_images(run):
     assert (code, err) == (0, "")
     for line in ("fixed.nii.gz", "30 × 26 × 22", "1.5 × 1 × 2", "0, 0, 0", "LPS", "float32", "nothing looks wrong"):
         assert line in out
-    assert len(out.splitlines()) == 9
+    assert len(out.splitlines()) == 10
+    assert "register will choose: similarity lncc: the images have one contrast" in out
 
 
 def test_the_verb_warns_and_draws(run, tmp_path):

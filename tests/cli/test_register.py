@@ -1,5 +1,6 @@
 """The command: what it writes, what it says, and how it fails. The engine is a stand-in, but for one test."""
 
+import io
 import json
 import os
 import subprocess
@@ -13,6 +14,7 @@ import SimpleITK as sitk
 import torch
 
 from torchdeform.cli.main import main, torchdeform
+from torchdeform.cli.register import verdict_text
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, resample
 from torchdeform.errors import ComputationError
@@ -66,6 +68,34 @@ def test_pictures_end_to_end(folder, engine, capsys):
     assert _names(folder / "results" / "one") == sorted([*RESULTS, "warped.png"])
     warped = read_image("results/one/warped.png")
     assert (warped.pixel_type, tuple(warped.data.shape)) == ("uint8", (1, 3, 24, 30))
+
+
+def test_strict_ends_with_3_only_if_the_verdict_is_bad(folder, engine, capsys, make_result, fine_evidence):
+    pair = ["fixed.png", "moving.png", "--out", "one", "--overwrite"]
+    assert main([*pair, "--strict"]) == 0
+    bad = replace(fine_evidence, information=0.1, information_before=0.1, structure_before=0.1)
+    engine.register = lambda *images, **more: replace(make_result(*images, **more), evidence=(bad,))
+    capsys.readouterr()
+    assert main([*pair, "--strict"]) == 3
+    assert capsys.readouterr().out.startswith("✗ Do not use this: the images do not fit.\n  The images do not fit (")
+    assert main(pair) == 0
+    verdict = json.loads((folder / "one" / "result.json").read_text(encoding="utf-8"))["verdict"]
+    assert (verdict["kind"], verdict["findings"][0]["kind"]) == ("bad", "bad")
+    assert verdict["findings"][1]["figures"] == {"information": 0.1}
+    assert "Do not use this: the images do not fit." in (folder / "one" / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_sign_of_the_verdict_suits_the_terminal(monkeypatch):
+    verdict = {"kind": "good", "headline": "Fine.", "findings": []}
+    for encoding, sign in (("utf-8", "✓"), ("ascii", "OK"), ("cp1252", "OK")):
+        monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+        assert f"{sign} Fine." in verdict_text(verdict)
+
+
+def test_warnings_are_not_said_twice():
+    findings = [{"kind": "look", "text": text} for text in ("Warning: a.png is odd.", "The map is odd (3).")]
+    shown = verdict_text({"kind": "look", "headline": "Look.", "findings": findings})
+    assert shown.splitlines()[1:] == ["  The map is odd (3)."]
 
 
 def test_volumes_end_to_end(folder, engine):

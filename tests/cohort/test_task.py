@@ -30,6 +30,8 @@ def test_a_pair_that_is_done_has_its_figures(do, jobs, tmp_path, capfd):
     assert (report.status, report.sentence) == (DONE, "")
     assert report.figures["folds"] == 0
     assert report.figures["similarity_after"] >= report.figures["similarity_before"]
+    assert report.figures["verdict"] in ("good", "look")
+    assert report.figures["headline"]
     assert set(report.files) == {path.name for path in jobs[0].files.out.iterdir()}
     assert report.seconds > 0
     assert report.peak_memory > 0

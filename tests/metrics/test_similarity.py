@@ -5,6 +5,8 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
+from metric_images import images as related
+from metric_images import soft_mask
 from nested_settings import changed, settings_of
 
 from torchdeform.cohort.estimate import estimate
@@ -19,6 +21,7 @@ from torchdeform.metrics.similarity import (
     MEASURES,
     features,
     make_similarity,
+    mark,
     measure_name,
     needs_common_scale,
     similarity_weights,
@@ -175,3 +178,31 @@ def test_a_new_measure_is_a_new_row(monkeypatch, tmp_path):
 
 def test_several_measures_have_one_name():
     assert (measure_name("mi"), measure_name({"lncc": 1, "mi": 0.5})) == ("mi", "lncc + mi")
+
+
+@pytest.mark.parametrize("shape", [(48, 40), (22, 20, 18)])
+@pytest.mark.parametrize("name", [*MEASURES, "several"])
+def test_a_mark_is_1_for_the_image_itself_and_about_0_for_noise(name, shape):
+    similarity = {"lncc": 1.0, "mind": 2.0} if name == "several" else name
+    first, second = torch.rand(2, 1, 1, *shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    mask = soft_mask(shape, items=1)
+    for given in (None, mask):
+        assert mark(similarity, first, first, mask=given).item() == pytest.approx(1, abs=1e-9)
+        assert abs(mark(similarity, first, second, mask=given).item()) < 0.1
+
+
+@pytest.mark.parametrize("name", list(MEASURES))
+def test_a_mark_looks_only_where_there_is_contrast(name):
+    """A picture on a large empty background has the mark of the picture alone, nearly."""
+    fixed, warped = related((40, 40), items=1)
+    wide = [torch.nn.functional.pad(x, (0, 120), value=0.0) for x in (fixed, warped)]
+    alone, padded = mark(name, fixed, warped).item(), mark(name, *wide).item()
+    assert padded == pytest.approx(alone, abs=0.12)
+
+
+def test_the_mark_of_ssd_is_the_concordance_correlation():
+    first, second = related((30, 34), items=1)
+    f, w = first.flatten(), (second + 0.1).flatten()
+    covariance = ((f - f.mean()) * (w - w.mean())).mean()
+    expected = 2 * covariance / (f.var(correction=0) + w.var(correction=0) + (f.mean() - w.mean()).square())
+    assert mark("ssd", first, second + 0.1).item() == pytest.approx(expected.item(), rel=1e-3)

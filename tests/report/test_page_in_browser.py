@@ -1,5 +1,7 @@
 """The page in a real browser: pictures show, sliders move, keys work, nothing is complained about or asked for."""
 
+from dataclasses import replace
+
 import chromium
 import pytest
 
@@ -172,6 +174,20 @@ def test_another_image_is_chosen(browser, page):
     browser.press("ArrowRight")
     assert browser.run(source) != first
     assert browser.run("document.querySelector('.stage .other-title').textContent") == "moving, aligned"
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_light_page_works_as_well(browser, tmp_path, make_full, dim):
+    """Every image and every way to compare is there, but no picture of the map; it is smaller."""
+    report_data, record = make_full(dim)
+    write_report(tmp_path / "full.html", report_data, record)
+    write_report(tmp_path / "light.html", replace(report_data, light=True), record)
+    assert (tmp_path / "light.html").stat().st_size < 0.9 * (tmp_path / "full.html").stat().st_size
+    browser.open(tmp_path / "light.html")
+    browser.run("document.querySelectorAll('input[name=other], input[name=mode]').forEach(input => input.click())")
+    assert browser.run("document.querySelectorAll('.grid, [data-name=log_det]').length") == 0
+    assert browser.run("document.querySelectorAll('input[name=other]').length") == 2
+    assert browser.run("document.querySelectorAll('.curve svg').length") == 2
 
 
 def test_less_motion_means_no_flicker(browser, tmp_path, make_full):

@@ -57,7 +57,7 @@ def test_the_worst_place_is_found(make_result, dim):
     def place(absent=None, **given):
         annotations = Annotations(**given)
         sampler = PairSampler(fixed, moving, result, annotations)
-        return worst_place(sampler, landmarks_of(fixed, result, annotations), absent)
+        return worst_place(sampler, landmarks_of(fixed, result, annotations), absent, alike=True)
 
     assert place().node == pytest.approx(spot, abs=2)
     hidden = torch.zeros_like(fixed.data)
@@ -75,3 +75,31 @@ def test_the_worst_place_is_found(make_result, dim):
     found = place(fixed_points=here, moving_points=there, **both)
     assert found.node == pytest.approx(point)
     assert found.reason.startswith("landmark 4 is 5.1")
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_two_contrasts_are_compared_by_their_edges(make_image, make_result, dim):
+    """Where bright and dark are swapped everywhere, the place is that of an edge which only one image has."""
+    fixed, spot = make_image((40, 44, 48)[-dim:]), (12, 30, 33)[-dim:]
+    other = 200 - fixed.data
+    other[(..., *(slice(k - 4, k + 5) for k in spot))] = 300.0
+    moving, still = replace(fixed, data=other), torch.zeros(1, dim, *fixed.grid.shape)
+    result = replace(make_result(fixed, moving), displacement=still, inverse=still, warped=other)
+    found = worst_place(PairSampler(fixed, moving, result, Annotations()), None, None, alike=False)
+    assert found.node == pytest.approx(spot, abs=6)
+    assert found.reason == "the edges differ most here"
+
+
+def test_what_the_moving_image_does_not_show_is_not_the_worst_place(make_image, make_result):
+    """Labels beyond it have no partner, which says nothing about the registration."""
+    fixed = make_image((40, 60))
+    label = torch.zeros_like(fixed.data)
+    label[..., 25:40, 35:60] = 1.0
+    label[..., 5:9, 5:9] = 1.0
+    half = replace(fixed, data=fixed.data[..., :30], grid=Grid((40, 30)))
+    still = torch.zeros(1, 2, 40, 60)
+    result = replace(make_result(fixed, half), displacement=still, inverse=still)
+    given = Annotations(fixed_labels=replace(fixed, data=label), moving_labels=replace(half, data=0 * half.data + 2))
+    given.moving_labels.data[..., 9:, :] = 0.0  # type: ignore[union-attr]
+    found = worst_place(PairSampler(fixed, half, result, given), None, None, alike=True)
+    assert found.node[1] < 30

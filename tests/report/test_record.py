@@ -24,6 +24,8 @@ def test_record_is_plain_json(tmp_path, make_image, make_result):
     assert record["settings"]["similarity"]["window"] == 7
     assert record["fixed"]["size"] == [31, 26, 20]
     assert record["folds"] == 0
+    assert record["verdict"]["kind"] == "good"
+    assert record["evidence"]["information"] == 0.7
     assert 0 < record["determinant_min"] < 1 < record["determinant_max"]
     assert len(record["levels"]) == 2
     assert set(record["versions"]) == {"torchdeform", "torch", "python"}

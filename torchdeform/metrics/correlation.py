@@ -250,12 +250,12 @@ def _products(warped: Tensor, fixed: Tensor, weight: Tensor | None) -> Tensor:
     return fields
 
 
-def local_contrast(image: Tensor, window: int) -> Tensor:
+def local_contrast(image: Tensor, window: int, deviation: float = LNCC_CONTRAST) -> Tensor:
     """Return the largest `contrast` of all channels in the windows around each voxel, ``(B, 1, *S)``."""
     count = box_sum(torch.ones_like(image[:1, :1]), window)
     middle = box_sum(image, window) / count
     variance = box_sum(image * image, window) / count - middle * middle
-    return contrast(variance.clamp(min=0).amax(1, keepdim=True))
+    return contrast(variance.clamp(min=0).amax(1, keepdim=True), deviation)
 
 
 # Images are multiplied by this in `ForegroundLNCC`, so that ε is small against τ² and hardly a window is flat.

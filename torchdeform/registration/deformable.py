@@ -127,7 +127,8 @@ def _examined(
     begin("judging")
     began = perf_counter()
     maps = (result.displacement, result.inverse, result.grid)
-    evidence = gather_evidence(compared, *maps, disagreement=disagreement(compared, result.settings))
+    absent, apart = getattr(result, "absent", None), disagreement(compared, result.settings)
+    evidence = gather_evidence(compared, *maps, disagreement=apart, absent=absent)
     if labels is not None:
         evidence = with_labels(evidence, images, labels)
     return replace(result, evidence=evidence, seconds=result.seconds | {"judge": perf_counter() - began})

@@ -157,12 +157,13 @@ def _of_item(
     rough = problem.on(smaller(problem.grid, ROUGH[grid.dim]))
     before, after = Views.of(rough), Views.of(rough, u)
     start, end = Views.of(problem), Views.of(problem, u)
+    information, turned = before.turned()
     volume = (by_slabs(jacobian_determinant, u, grid).clamp(min=_TINY).log().abs() > math.log(_EXTREME)).to(u)
     size = problem.grid.spacing[-1] / grid.spacing[-1]  # of the voxels that edges are seen in
     return Evidence(
         correlation_before=before.correlation(),
         correlation=after.correlation(),
-        information_before=before.information(),
+        information_before=information,
         information=after.information(),
         structure_before=start.structure(),
         edges_before=size * start.edge_distance(),
@@ -174,7 +175,7 @@ def _of_item(
         extreme_inside=end.share(restrict(volume, grid, problem.grid)),
         inverse_error=_inverse_error(u, inverse, grid),
         covered=end.share(end.moving_weight),
-        turned=before.turned(),
+        turned=turned,
         absent=0.0 if absent is None else end.share(restrict(absent, grid, problem.grid)),
     )
 
@@ -252,13 +253,13 @@ class Views:
         weight = self.seen * self.both
         return float((apart * weight).sum() / weight.sum().clamp(min=_TINY))
 
-    def turned(self) -> tuple[str, ...]:
-        """Return the axes along which turning the moving image over makes it fit clearly better."""
+    def turned(self) -> tuple[float, tuple[str, ...]]:
+        """Return `information`, and the axes along which turning the moving image over raises it clearly."""
         names = dict(zip(self.grid.axes, "zyx"[-self.grid.dim :], strict=True))
         ways = [axes for count in range(1 + len(names)) for axes in combinations(names, count)]
         values = self._informations([self._moved(partial(torch.flip, dims=axes)) for axes in ways])
         best = max(range(len(ways)), key=values.__getitem__)
-        return tuple(names[axis] for axis in ways[best]) if values[best] > values[0] + _BETTER else ()
+        return values[0], tuple(names[axis] for axis in ways[best]) if values[best] > values[0] + _BETTER else ()
 
     def _informations(self, views: Sequence["Views"]) -> list[float]:
         away = [view._mutual() for view in self.pushed()]

@@ -21,7 +21,7 @@ MARKS = {GOOD: "✓", LOOK: "!", BAD: "✗"}
 _INFORMATION = 0.48  # (0.53, 0.44)
 _NO_INFORMATION = 0.25  # less than this is what unrelated pictures reach (0.14)
 _CORRELATION = 0.68  # (0.74, 0.76; unrelated pictures 0.51)
-_DISAGREEMENT = 0.12  # (0.10, 0.18)
+_DISAGREEMENT = {2: 0.13, 3: 0.25}  # by the number of axes (0.08, 0.19; 0.21, 0.40)
 _EXTREME = 0.18  # (0.13, 0.15)
 _COVERED = 0.6  # (0.67; half an image 0.54)
 _SIGNS = 3  # so many of the four signs that images do not belong together are enough
@@ -102,7 +102,7 @@ def judge(
         No figure proves that the right tissue is on the right tissue. Only labels, landmarks or a look can show it.
     """
     known = list(_annotations(evaluation, evidence.label_contrast, grid, unit))
-    found = [*_folds(folds), *_images(evidence, mirror), *_map(evidence)]
+    found = [*_folds(folds), *_images(evidence, grid.dim, mirror), *_map(evidence)]
     if evaluation is not None and _proven(evaluation) and all(some.kind == GOOD for some in known):
         found = [replace_bad(some) if some.kind == BAD and folds == 0 else some for some in found]
     found += [*known, *(Finding(LOOK, f"{WARNED}{text}.") for text in warnings)]
@@ -130,9 +130,9 @@ def _folds(folds: int) -> Iterator[Finding]:
         yield Finding(GOOD, "The map does not fold anywhere (checked exactly, not only by central differences).")
 
 
-def _images(evidence: Evidence, mirror: float) -> Iterator[Finding]:
+def _images(evidence: Evidence, dim: int, mirror: float) -> Iterator[Finding]:
     """Whether the images show the same, and fit."""
-    signs = list(_signs(evidence))
+    signs = list(_signs(evidence, dim))
     unlike = evidence.information < _NO_INFORMATION or len(signs) >= _SIGNS
     if unlike:
         text = "The images do not fit (they may not show the same, or the registration failed)."
@@ -157,7 +157,7 @@ def _images(evidence: Evidence, mirror: float) -> Iterator[Finding]:
         yield Finding(GOOD, text, {name: getattr(evidence, name) for name in names})
 
 
-def _signs(evidence: Evidence) -> Iterator[Finding]:
+def _signs(evidence: Evidence, dim: int) -> Iterator[Finding]:
     """Yield the signs that two images do not belong together."""
     e = evidence
     if not e.information >= _INFORMATION:
@@ -167,7 +167,7 @@ def _signs(evidence: Evidence) -> Iterator[Finding]:
     if not e.correlation >= _CORRELATION:
         text = f"What has contrast hardly correlates ({number(e.correlation)}; {_CORRELATION} and more are usual)."
         yield Finding(LOOK, text, {"correlation": e.correlation})
-    if e.disagreement > _DISAGREEMENT:
+    if e.disagreement > _DISAGREEMENT[dim]:
         text = "The map depends on the direction (from moving to fixed another one is found for "
         text += f"{e.disagreement:.0%} of what has contrast)."
         yield Finding(LOOK, text, {"disagreement": e.disagreement})

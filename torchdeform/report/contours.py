@@ -1,10 +1,14 @@
 """Outlines in a slice: of regions, of labels, and the edges of a picture, each a list of lines (across, down)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+
+from torchdeform.core.grid import Grid
+from torchdeform.deformation.monitors import smooth
 
 Floats = NDArray[np.floating]
 Lines = list[Floats]  # each (m, 2), in nodes
@@ -20,21 +24,28 @@ def outlines(labels: NDArray[Any]) -> list[Lines]:
 
     By marching squares, half way between a label's pixels and others: where two touch there is one of each.
     """
-    from scipy.ndimage import find_objects
-
     if not labels.any():
         return [[] for _ in labels]
     padded = np.pad(_codes(labels), ((0, 0), (1, 1), (1, 1)))
     down, across = np.mgrid[-1 : padded.shape[1] - 1, -1 : padded.shape[2] - 1].astype(np.float64)
-    found: list[Lines] = []
-    for flat in padded:
-        lines: Lines = []
-        for code, box in enumerate(find_objects(flat), start=1):
-            if box is not None:
-                part = tuple(slice(side.start - 1, side.stop + 1) for side in box)
-                lines += _level_lines(across[part], down[part], (flat[part] == code).astype(np.float64), 0.5)
-        found.append(lines)
+    found: list[Lines] = [[] for _ in labels]
+    for number, code, box in _boxes(padded):
+        inside = (padded[number][box] == code).astype(np.float64)
+        found[number] += _level_lines(across[box], down[box], inside, 0.5)
     return found
+
+
+def _boxes(codes: NDArray[np.int32]) -> Iterator[tuple[int, int, tuple[slice, slice]]]:
+    """Yield the number of the slice, the code and a box, one pixel larger, of each code other than 0."""
+    place = np.nonzero(codes)
+    key = place[0] * (int(codes.max()) + 1) + codes[place]
+    order = np.argsort(key, kind="stable")
+    _, firsts = np.unique(key[order], return_index=True)
+    ends = [f.reduceat(axis[order], firsts) for axis in place[1:] for f in (np.minimum, np.maximum)]
+    for k, first in enumerate(order[firsts]):
+        low, high, left, right = (int(end[k]) for end in ends)
+        box = (slice(low - 1, high + 2), slice(left - 1, right + 2))
+        yield int(place[0][first]), int(codes[tuple(axis[first] for axis in place)]), box
 
 
 def _codes(labels: NDArray[Any]) -> NDArray[np.int32]:
@@ -82,11 +93,10 @@ def edge_lines(pictures: NDArray[np.floating], spacing: Sequence[float]) -> list
         Marr and Hildreth, Theory of edge detection, 1980. Only where the slope is among the steepest of all slices, and
         only lines that are not short.
     """
-    from scipy.ndimage import gaussian_filter
-
     longest = max(n * h for n, h in zip(pictures.shape[1:], spacing, strict=True))
-    sigma = (0, *(max(0.8, _BLUR * longest / h) for h in spacing))
-    blurred = gaussian_filter(pictures.astype(np.float32), sigma)
+    grid = Grid(pictures.shape[1:], tuple(spacing))
+    sigma = max(_BLUR * longest, 0.8 * min(spacing))
+    blurred = smooth(torch.as_tensor(pictures).float().unsqueeze(1), grid, sigma)[:, 0].numpy()
     down, across = np.gradient(blurred, *spacing, axis=(1, 2))
     bend = np.gradient(down, spacing[0], axis=1) + np.gradient(across, spacing[1], axis=2)
     slope = np.hypot(down, across)

@@ -177,7 +177,8 @@ def _others(data: ReportData) -> dict[str, str]:
     """Return the images that can be compared with the fixed one, with their titles."""
     aligned = data.result.affine is not None
     titles = {WARPED: "warped", MOVING: "moving, aligned" if aligned else "moving", ORIGINAL: "moving, as it was"}
-    return {name: title for name, title in titles.items() if name in data.slices[0].fields}
+    shown = data.slices[0].fields.keys() - ({ORIGINAL} if data.light else set())
+    return {name: title for name, title in titles.items() if name in shown}
 
 
 class _Renderer:
@@ -202,7 +203,6 @@ class _Renderer:
         images = [
             Picture(name, title.capitalize(), _CAPTIONS[name], self._strips(name, None), self._over(name))
             for name, title in titles.items()
-            if not light or name in (FIXED, WARPED)
         ]
         found = {"Differences": differences, "Images": images}
         return found if light else found | {"The map": list(self._maps())}

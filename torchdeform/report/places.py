@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -56,16 +57,17 @@ def slice_of(plane: Plane, place: Place) -> int:
     return 0 if plane.through is None else min(max(round(place.node[plane.through]), 0), plane.depth - 1)
 
 
-def worst_place(sampler: PairSampler, landmarks: Landmarks | None, absent: Tensor | None) -> Place:
-    """Return the place where landmarks are farthest apart; else labels differ most; else grey values do, on average.
+def worst_place(sampler: PairSampler, landmarks: Landmarks | None, absent: Tensor | None, *, alike: bool) -> Place:
+    """Return the place where landmarks are farthest apart; else labels differ most; else the images do, on average.
 
     Args:
         sampler: of the pair.
         landmarks: those of the pair.
         absent: weight ``(1, 1, *S)`` of what is not compared.
+        alike: whether the images have one contrast, so that grey values can be compared; else their slopes are.
 
     Notes:
-        Labels and grey values are compared at some nodes, in a window of a tenth of the image.
+        Labels and images are compared at some nodes within the moving image, in a window of a tenth of the image.
     """
     if landmarks is not None:
         worst = int(landmarks.distances[WARPED].argmax())
@@ -76,17 +78,26 @@ def worst_place(sampler: PairSampler, landmarks: Landmarks | None, absent: Tenso
     some = (..., *(slice(h // 2, None, h) for h in step))
     points = grid.points()[some].to(sampler.u)
     fixed, warped = (sampler.at(image, points, lambda field: field[some]) for image in (FIXED, WARPED))
+    if fixed.labels is not None and warped.labels is not None:
+        differ = ((fixed.labels != warped.labels) & warped.inside).float()
+        return Place(_densest(differ, step, grid), "the labels differ most here")
     weight = warped.inside.float() if fixed.mask is None else (warped.inside & (fixed.mask != 0)).float()
     weight = weight if absent is None else weight * (1 - absent[some])
-    if fixed.labels is not None and warped.labels is not None:
-        differ = (fixed.labels != warped.labels).float()
-        return Place(_densest(differ, step, grid), "the labels differ most here")
-    return Place(_densest((fixed.grey - warped.grey).abs() * weight, step, grid), "the images differ most here")
+    first, second = (image.grey if alike else _steepness(image.grey) for image in (fixed, warped))
+    what = "grey values" if alike else "edges"
+    return Place(_densest((first - second).abs() * weight, step, grid), f"the {what} differ most here")
+
+
+def _steepness(values: Tensor) -> Tensor:
+    """Return the length of the gradient, 1 on average."""
+    axes = [axis for axis in range(2, values.dim()) if values.shape[axis] > 1]
+    slopes = torch.stack(torch.gradient(values, dim=axes)).norm(dim=0)
+    return slopes / slopes.mean().clamp(min=1e-12)
 
 
 def _densest(values: Tensor, step: Sequence[int], grid: Grid) -> tuple[float, ...]:
     """Return the node around which values at every ``step``-th node are largest."""
     window = [min(_WINDOW, n - 1 + n % 2) for n in values.shape[2:]]
     mean = AVERAGE_POOL[grid.dim](values, window, 1, [w // 2 for w in window])
-    index = torch.unravel_index(mean.flatten().argmax(), mean.shape[2:])
+    index = np.unravel_index(int(mean.argmax()), mean.shape[2:])  # torch's loads sympy for it
     return tuple(float(min(int(k) * h + h // 2, n - 1)) for k, h, n in zip(index, step, grid.shape, strict=True))

@@ -11,6 +11,7 @@ from torchdeform.core.derivatives import CURL_PAIRS, by_slabs, determinant, jaco
 from torchdeform.core.grid import Grid, over_slabs
 from torchdeform.core.image import Image
 from torchdeform.core.warp import sample, voxels
+from torchdeform.metrics.similarity import similarity_weights
 from torchdeform.registration.problem import Annotations
 from torchdeform.registration.result import RegistrationResult
 from torchdeform.report.landmarks import landmarks_of
@@ -26,6 +27,7 @@ _SHORTEST_SCALES = {"log_det": math.log(2), "inverse_error": 0.5}
 _BINS = 81
 _ALL = 130  # slices of all planes together that are shown if there are no more
 _MOST = 31  # slices of a plane otherwise
+_OF_ONE_CONTRAST = {"lncc", "ncc", "ssd"}  # measures that are for such images
 _FEW = 5  # slices of a plane in a light report
 
 
@@ -119,7 +121,8 @@ def _known(sampler: PairSampler, result: RegistrationResult, annotations: Annota
     absent = getattr(result, "absent", None)
     absent = None if absent is None else absent.detach().cpu()
     landmarks = landmarks_of(sampler.fixed, result, annotations)
-    return Known(worst_place(sampler, landmarks, absent), landmarks, absent)
+    alike = set(similarity_weights(result.settings.similarity.measure)) <= _OF_ONE_CONTRAST
+    return Known(worst_place(sampler, landmarks, absent, alike=alike), landmarks, absent)
 
 
 def _numbers(fixed: Image, worst: Place, most: int | None) -> dict[Plane, tuple[int, ...]]:

@@ -1,0 +1,116 @@
+"""Tissue that one image has and the other does not: resected, torn off, cut off; the similarity lets go of it."""
+
+import math
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchdeform.core.grid import Grid, per_item
+from torchdeform.core.intensities import fill
+from torchdeform.core.resampling import prolong, restrict, with_spacing
+from torchdeform.core.warp import warp
+from torchdeform.metrics.correlation import local_contrast
+from torchdeform.registration.problem import RegistrationProblem
+
+# Regions are looked for on a grid of at most so many nodes to the power of D; narrower ones than 2 · radius + 1 of its
+# voxels are left to the map, which can close them.
+_NODES, _COARSER, _RADIUS = 64, 1.05, 2
+
+# Of images scaled to [0, 1], voxels this near to the background show nothing, and those this far from it tissue, if
+# windows of this width around them have this standard deviation.
+_EMPTY, _FULL, _WINDOW, _TEXTURE = 0.03, 0.1, 5, 0.03
+
+# Of more than this share of the tissue it is not believed that it is absent: the images are not aligned then.
+_MOST = 0.35
+
+# Share of the border that must have one value for it to be that of the background.
+_BORDER = 0.5
+
+_POOL = {2: F.max_pool2d, 3: F.max_pool3d}
+
+
+def let_go(problem: RegistrationProblem) -> tuple[RegistrationProblem, tuple[Tensor, Tensor] | None]:
+    """Return the problem without what only one image shows, and where the fixed and the moving image show nothing.
+
+    Args:
+        problem: images scaled to about [0, 1], in the place where the deformation begins.
+
+    Returns:
+        The problem with that left out of the masks and filled in, and two regions ``(B, 1, *S)`` of 0 and 1; None in
+        place of them where there is nothing of the kind.
+
+    Notes:
+        Nothing corresponds where one image is empty, as its border is, over a width that a map would have to close or
+        to open as a whole, and the other has contrast throughout. Each region is fixed to the image that is empty
+        there, so a map carries that of the moving image with it. Costs some passes over both images.
+    """
+    regions = absent_regions(problem)
+    if not any(bool(region.any()) for region in regions):
+        return problem, None
+    kept = [1 - region for region in regions]
+    given = (problem.fixed_mask, problem.moving_mask)
+    masks = [keep if mask is None else keep * mask for keep, mask in zip(kept, given, strict=True)]
+    images = [fill(image, keep) for image, keep in zip((problem.fixed, problem.moving), kept, strict=True)]
+    problem = replace(problem, fixed=images[0], moving=images[1], fixed_mask=masks[0], moving_mask=masks[1])
+    return problem, (regions[0], regions[1])
+
+
+def absent_regions(problem: RegistrationProblem) -> list[Tensor]:
+    """Return where the fixed image is empty and the moving one is not, and the other way round, ``(B, 1, *S)``."""
+    grid, images = problem.grid, (problem.fixed, problem.moving)
+    coarse = _coarse(grid)
+    empty = [_background(image, _EMPTY) for image in images]
+    shares = [restrict(region, grid, coarse) for region in empty]
+    tissue = [_tissue(restrict(image, grid, coarse)) for image in images]
+    if problem.mask is not None:
+        seen = (restrict(problem.mask, grid, coarse) > 0.5).to(problem.fixed)
+        tissue = [region * seen for region in tissue]
+    found = []
+    for share, full, other in zip(shares, empty, reversed(tissue), strict=True):
+        core = _opened((share > 0.5) * other)
+        part = core.flatten(1).sum(1) / other.flatten(1).sum(1).clamp(min=1)
+        core = core * per_item((part < _MOST).to(core), core)
+        near = prolong(_dilated(core, 2 * _RADIUS), grid) > 0.5
+        found.append(full * near)
+    return found
+
+
+def moved_with(regions: tuple[Tensor, Tensor], u: Tensor, grid: Grid) -> Tensor:
+    """Return where the similarity was let go on the fixed grid ``(B, 1, *S)``, 0 to 1, after the map u."""
+    return torch.maximum(regions[0], warp(regions[1], u, grid))
+
+
+def _coarse(grid: Grid) -> Grid:
+    """Return the finest grid of the same box, or the grid itself, with few enough nodes."""
+    size, coarse = min(grid.spacing), grid
+    while math.prod(coarse.shape) > _NODES**grid.dim:
+        size *= _COARSER
+        coarse = with_spacing(grid, size)
+    return coarse
+
+
+def _background(image: Tensor, within: float) -> Tensor:
+    """Return where all channels are as the border is ``(B, 1, *S)``; nowhere if the border is not of one value."""
+    faces = [image.select(axis, end).flatten(2) for axis in range(2, image.dim()) for end in (0, -1)]
+    border = torch.cat(faces, dim=2)
+    level = border.median(dim=2).values
+    pure = ((border - level.unsqueeze(2)).abs().amax(1) < _EMPTY).to(image).mean(1) > _BORDER
+    away = (image - level.view(*level.shape, *[1] * (image.dim() - 2))).abs().amax(1, keepdim=True)
+    return (away < within).to(image) * per_item(pure.to(image), image)
+
+
+def _tissue(image: Tensor) -> Tensor:
+    """Return where an image shows something, ``(B, 1, *S)``."""
+    return (local_contrast(image, _WINDOW, _TEXTURE) > 0.5).to(image) * (1 - _background(image, _FULL))
+
+
+def _opened(region: Tensor) -> Tensor:
+    """Return the parts of a region that are wider than 2 · radius voxels."""
+    return _dilated(1 - _dilated(1 - region, _RADIUS), _RADIUS)
+
+
+def _dilated(region: Tensor, radius: int) -> Tensor:
+    """Return the union of all cubes of that radius around the region."""
+    return _POOL[region.dim() - 2](region, 2 * radius + 1, 1, radius)
