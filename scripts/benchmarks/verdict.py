@@ -3,8 +3,8 @@
 Usage: python scripts/benchmarks/verdict.py [DATA] [--only KIND ...]
 
 DATA is the folder of images, TORCHDEFORM_DATA or ../shared/data by default. Good pairs are judged with the labels and
-landmarks that they have, bad ones without, unless these are what is wrong. Pairs that the check refuses count as bad.
-Thresholds were chosen on the cases of the half "chosen on"; the other half had no say.
+landmarks that they have, bad ones without, unless these are what is wrong. Pairs that are refused with a sentence
+count as bad. The halves are every other case of a kind.
 """
 
 import argparse
@@ -36,7 +36,10 @@ def verdict_on(case: Case) -> Verdict:
     report = preflight(scene.fixed, scene.moving, aligned=settings.align.kind != "none", settings=settings, **masks)
     for refused in report.of(ERROR):
         return Verdict(BAD, refused, ())
-    result = td.register(scene.fixed, scene.moving, settings, annotations=known)
+    try:
+        result = td.register(scene.fixed, scene.moving, settings, annotations=known)
+    except td.InputError as refused:
+        return Verdict(BAD, str(refused), ())
     return replace(result, warnings=(*report.of(WARNING), *result.warnings)).verdict
 
 
@@ -54,9 +57,9 @@ def misses(rows: Iterable[tuple[Case, Verdict]]) -> list[str]:
 
 def confusion(rows: list[tuple[Case, Verdict]]) -> list[str]:
     """Return the table: kinds of pairs, and how many of each half are taken for good, look and bad."""
-    counts = Counter((case.kind, case.tune, verdict.kind) for case, verdict in rows)
+    counts = Counter((case.kind, case.first, verdict.kind) for case, verdict in rows)
     kinds = [kind for kind in KINDS if any(name == kind for name, _, _ in counts)]
-    lines = ["| pairs | chosen on: good | look | bad | held back: good | look | bad |", "| --- |" + " --- |" * 6]
+    lines = ["| pairs | first half: good | look | bad | second half: good | look | bad |", "| --- |" + " --- |" * 6]
     for kind in kinds:
         lines.append(_line(kind, [counts[kind, half, name] for half in (True, False) for name in VERDICTS]))
     bad = [kind for kind in kinds if kind != GOOD_PAIR]

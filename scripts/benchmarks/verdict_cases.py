@@ -34,12 +34,12 @@ class Scene:
 
 @dataclass(frozen=True)
 class Case:
-    """A scene that is made when it is wanted. Half of the cases, ``tune``, may choose thresholds."""
+    """A scene that is made when it is wanted; every other case of a kind belongs to the first half."""
 
     kind: str
     name: str
     make: Callable[[], Scene]
-    tune: bool = True
+    first: bool = True
 
 
 def scene(pair: Pair, *, labels: bool = False, points: bool = False, masks: bool = True, **overrides: Any) -> Scene:
@@ -277,6 +277,14 @@ def _labels(cases: Cases) -> _Made:
     for index, other in ((0, 5), (2, 9), (7, 3)):
         pair, path = cases._pair("heart_2d", index), cases._pair("heart_2d", other).moving_labels
         yield f"heart_2d {pair.name}, another's", lambda p=pair, q=path: with_labels_of(scene(p, labels=True), q)
+    for name, index, other in (
+        ("mindboggle_2d", 2, 5),
+        ("mindboggle_2d", 4, 0),
+        ("hippocampus_3d", 2, 5),
+        ("hippocampus_3d", 6, 2),
+    ):
+        pair, path = cases._pair(name, index), cases._pair(name, other).moving_labels
+        yield f"{name} {pair.name}, another's", lambda p=pair, q=path: with_labels_of(scene(p, labels=True), q)
     pair = cases._pair("mindboggle_2d", 5)
     yield f"mindboggle_2d {pair.name}, mirrored", partial(_with_changed_labels, pair, flipped(1))
 

@@ -45,6 +45,17 @@ def test_an_image_is_left_where_it_is_when_it_is_aligned_with_itself(shape):
     assert placed.unaligned.item() == pytest.approx(1, abs=1e-5)
 
 
+def test_a_place_where_nothing_but_background_is_seen_is_not_taken():
+    """The spacing of one file is wrong by 100, so the files put the fixed image beside the first pixel of the other."""
+    data = torch.nn.functional.pad(blobs((56, 56), 1), (4, 4, 4, 4))
+    moving = Image(data, Grid((64, 64), (100.0, 100.0)), name="moving")
+    placed = place(as_image(data), moving, SETTINGS, Annotations())
+    assert placed.unaligned is not None
+    assert float(placed.unaligned) == 0
+    assert placed.alignment is not None
+    assert placed.alignment.start != "geometry"
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_shift_is_found_and_taken(shape):
     grid = Grid(shape)

@@ -61,9 +61,10 @@ def test_the_images_and_the_map_are_judged(fine_evidence, change, kind, words):
     ("evaluation", "kind", "words"),
     [
         (labels(([0.5], 4.0), ([0.7], 3.0)), GOOD, "better than before (mean Dice 0.5 → 0.7; 1 of 1 better, 0 worse)"),
-        (labels(([0.5], 4.0), ([0.505], 4.0)), GOOD, "no better than before"),
+        (labels(([0.75], 4.0), ([0.755], 4.0)), GOOD, "no better than before"),
         (labels(([0.5], 4.0), ([0.4], 3.0)), BAD, "overlap less than before (mean Dice 0.5 → 0.4)"),
         (labels(([0.0], 9.0), ([0.02], 9.0)), BAD, "do not overlap"),
+        (labels(([0.1], 9.0), ([0.15], 9.0)), BAD, "do not overlap"),
         (labels(([0.5], 4.0), ([math.nan], math.inf)), GOOD, "images fit"),
         (labels(([0.5, 0.6], 4.0), ([0.9, 0.5], 3.0)), LOOK, "1 worse, most of all label 2: 0.6 → 0.5"),
         (labels(([0.5, 0.6, 0.6], 4.0), ([0.9, 0.5, 0.7], 3.0)), GOOD, "2 of 3 better, 1 worse"),
@@ -81,6 +82,22 @@ def test_labels_and_landmarks_are_judged_one_by_one(fine_evidence, evaluation, k
     verdict = judge(fine_evidence, GRID, folds=0, evaluation=evaluation)
     assert verdict.kind == kind
     assert any(words in finding.text for finding in verdict.findings)
+
+
+def test_labels_that_do_not_follow_their_images_are_of_others(fine_evidence):
+    """The fine evidence: correlation 0.5 → 0.9, so the images fit much better."""
+    for after, kind in ((0.45, GOOD), (0.36, LOOK), (0.32, BAD)):
+        found = labels(([0.2], 4.0), ([0.3], 4.0), ([after], 4.0))
+        assert judge(fine_evidence, GRID, folds=0, evaluation=found).kind == kind
+        near = replace(fine_evidence, correlation_before=0.88)
+        assert judge(near, GRID, folds=0, evaluation=found).kind == GOOD
+
+
+def test_labels_of_another_image_do_not_stand_out_from_it(fine_evidence):
+    better = labels(([0.5], 4.0), ([0.8], 3.0))
+    for contrast, kind in (((0.5, 0.4), GOOD), ((0.5, 0.1), BAD), ((0.05, 0.3), BAD), ((0.15, 0.01), GOOD)):
+        known = replace(fine_evidence, label_contrast=contrast)
+        assert judge(known, GRID, folds=0, evaluation=better).kind == kind
 
 
 def test_distances_are_in_the_unit_of_the_file(fine_evidence):

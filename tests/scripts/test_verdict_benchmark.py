@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -10,14 +11,13 @@ import pytest
 @pytest.fixture
 def benchmark(root, monkeypatch):
     monkeypatch.syspath_prepend(str(root / "scripts" / "benchmarks"))
-    import verdict
 
-    return verdict
+    return import_module("verdict")
 
 
 def test_the_table_counts_kinds_and_halves(benchmark):
-    def row(kind, tune, verdict):
-        return benchmark.Case(kind, f"a {kind} pair", lambda: None, tune), benchmark.Verdict(verdict, "Because.", ())
+    def row(kind, first, verdict):
+        return benchmark.Case(kind, f"a {kind} pair", lambda: None, first), benchmark.Verdict(verdict, "Because.", ())
 
     rows = [
         row("good pair", True, "good"),
@@ -43,7 +43,7 @@ def test_there_are_enough_cases_of_both_halves(benchmark, data_folder):
     assert len(good) == 35
     assert len(cases) - len(good) >= 60
     assert {case.kind for case in cases} == set(benchmark.KINDS)
-    assert abs(sum(case.tune for case in cases) - len(cases) / 2) < 10
+    assert abs(sum(case.first for case in cases) - len(cases) / 2) < 10
     assert len({(case.kind, case.name) for case in cases}) == len(cases)
 
 

@@ -35,6 +35,7 @@ _EDGES = 0.1  # share of the voxels, those with the largest gradients, that are 
 _LEVELS = 16  # grey levels that mutual information tells apart
 _LEAST = 0.05  # information of an image about itself that counts as none
 _BETTER = 0.2  # by so much more information a turned image has to fit better
+_ASKED = 500  # edges whose distance from those of the other image is measured, at most
 _KNOWN = 0.5  # weight from which on a voxel counts
 _TINY = 1e-9
 
@@ -90,10 +91,11 @@ class Evidence:
 
 
 def to_compare(problem: RegistrationProblem) -> RegistrationProblem:
-    """Return one channel of a problem on a grid of few nodes, all that `gather_evidence` needs."""
+    """Return one channel of a problem on a grid of few nodes and on the CPU, all that `gather_evidence` needs."""
     grey = {name: getattr(problem, name).mean(1, keepdim=True) for name in ("fixed", "moving")}
-    few = smaller(problem.grid, _DETAIL[problem.grid.dim])
-    return replace(problem, **grey, fixed_points=None, moving_points=None).on(few)
+    few = replace(problem, **grey, fixed_points=None, moving_points=None)
+    few = few.on(smaller(problem.grid, _DETAIL[problem.grid.dim]))
+    return replace(few, **{name: None if field is None else field.cpu() for name, field in _fields(few).items()})
 
 
 def smaller(grid: Grid, nodes: int) -> Grid:
@@ -143,8 +145,11 @@ def gather_evidence(
 
 
 def _item(problem: RegistrationProblem, index: int) -> RegistrationProblem:
-    fields = {name: getattr(problem, name) for name in ("fixed", "moving", "fixed_mask", "moving_mask")}
-    return replace(problem, **{name: None if f is None else _part(f, index) for name, f in fields.items()})
+    return replace(problem, **{name: None if f is None else _part(f, index) for name, f in _fields(problem).items()})
+
+
+def _fields(problem: RegistrationProblem) -> dict[str, Tensor | None]:
+    return {name: getattr(problem, name) for name in ("fixed", "moving", "fixed_mask", "moving_mask")}
 
 
 def _part(field: Tensor, index: int) -> Tensor:
@@ -217,7 +222,7 @@ class Views:
         )
         moving = problem.moving
         if u is not None:
-            w = prolong(u, problem.grid)
+            w = prolong(u, problem.grid).to(problem.fixed)
             moving, second = (
                 warp(field, w, problem.grid, outside=outside) for field, outside in ((moving, None), (second, 0.0))
             )
@@ -230,7 +235,7 @@ class Views:
 
     def share(self, field: Tensor) -> float:
         """Return the mean of a field over what has contrast in the fixed image."""
-        return float((field * self.seen).sum() / self.seen.sum().clamp(min=_TINY))
+        return float((field.to(self.seen) * self.seen).sum() / self.seen.sum().clamp(min=_TINY))
 
     def correlation(self) -> float:
         """Return the mean squared correlation in windows around what has contrast."""
@@ -284,18 +289,20 @@ class Views:
 
     def edge_distance(self) -> float:
         """Return the mean distance in voxels between strong edges of one image and the nearest of the other."""
-        from scipy.ndimage import distance_transform_edt
-
         known = self.both > 0
-        edges = [_edges(image, known) for image in (self.fixed, self.moving)]
-        if not all(bool(some.any()) for some in edges):
+        if not bool(known.any()):
             return math.inf
-        far = [torch.from_numpy(distance_transform_edt(~some.cpu().numpy())) for some in edges]
-        return float((far[1][edges[0].cpu()].sum() + far[0][edges[1].cpu()].sum()) / sum(int(e.sum()) for e in edges))
+        one, other = (_edges(image, known)[0, 0].nonzero().float() for image in (self.fixed, self.moving))
+        if not (len(one) and len(other)):
+            return math.inf
+        some = ((edges[:: math.ceil(len(edges) / _ASKED)], rest) for edges, rest in ((one, other), (other, one)))
+        return sum(float(torch.cdist(*pair).amin(1).mean()) for pair in some) / 2
 
     def foreground_overlap(self) -> float:
         """Return the Dice overlap of what is brighter than Otsu's threshold, where both images are known."""
         known = self.both > 0
+        if not bool(known.any()):
+            return 0.0
         first, second = (image[known] > otsu(image[known]) for image in (self.fixed, self.moving))
         return float(2 * (first & second).sum() / (first.sum() + second.sum()).clamp(min=1))
 
@@ -337,7 +344,7 @@ def _edges(image: Tensor, known: Tensor) -> Tensor:
 def otsu(values: Tensor) -> float:
     """Return the threshold that leaves the least variance within the values on either side of it."""
     low, high = (float(end) for end in values.aminmax())
-    count = torch.histc(values.float(), 256, min=low, max=high).double().cpu()
+    count = torch.histc(values.float(), 256, min=low, max=high).double()
     centre = low + (high - low) * (torch.arange(256, dtype=torch.float64) + 0.5) / 256
     below, total = count.cumsum(0), (count * centre).cumsum(0)
     above = below[-1] - below

@@ -11,6 +11,7 @@ from torchdeform.core.image import AUTO, Image, overlap
 from torchdeform.core.resampling import box_sum, with_spacing
 from torchdeform.core.stages import begin
 from torchdeform.core.transform import Affine
+from torchdeform.errors import InputError
 from torchdeform.metrics.correlation import LNCC_FLOOR, contrast, local_contrast
 from torchdeform.metrics.similarity import mark
 from torchdeform.registration.affine.align import Alignment, align
@@ -97,10 +98,13 @@ def problem_at(fixed: PlacedImage, moving: PlacedImage, affine: Affine | None) -
 
 def _marked(problem: RegistrationProblem, settings: RegistrationSettings) -> tuple[Tensor, Tensor]:
     """Return mark and merit of two images, each ``(B,)``, 0 where they have no voxel in common."""
-    mask = problem.mask
+    mask, nothing = problem.mask, problem.fixed.new_zeros(len(problem.fixed))
     if mask is not None and not bool((mask > 0).flatten(1).any(1).all()):
-        return (nothing := problem.fixed.new_zeros(len(problem.fixed))), nothing
-    scaled, chosen = problem.scaled(settings), settings.similarity
+        return nothing, nothing
+    try:
+        scaled, chosen = problem.scaled(settings), settings.similarity
+    except InputError:  # the part of an image that is seen is constant
+        return nothing, nothing
     found = mark(chosen.measure, scaled.fixed, scaled.moving, mask=mask, window=chosen.window, grid=problem.grid)
     contrast = local_contrast(scaled.fixed, chosen.window)
     counted = contrast if problem.fixed_mask is None else contrast * problem.fixed_mask

@@ -16,8 +16,8 @@ _ORDER = (BAD, LOOK, GOOD)
 WARNED = "Warning: "  # how findings begin that repeat a warning about the input
 MARKS = {GOOD: "✓", LOOK: "!", BAD: "✗"}
 
-# Thresholds, from the half of the cases of `scripts/benchmarks/verdict.py` that may choose them. In brackets: the
-# worst of the good pairs of one contrast, and the best of the pairs that show something else.
+# Thresholds, about in the middle of the gaps between the good and the bad pairs of `scripts/benchmarks/verdict.py`. In
+# brackets: the worst of the good pairs of one contrast, and the best of the pairs that show something else.
 _INFORMATION = 0.48  # (0.53, 0.44)
 _NO_INFORMATION = 0.25  # less than this is what unrelated pictures reach (0.14)
 _CORRELATION = 0.68  # (0.74, 0.76; unrelated pictures 0.51)
@@ -34,9 +34,12 @@ _MIRROR, _MIRRORED = 1.1, 1.2  # merit of a mirrored alignment over the best one
 
 _SEEN, _UNSEEN = 0.2, 0.4  # contrast of labels in one image, and share of it in the other, from which on they differ
 _STEADY = 0.01  # a change of Dice, or of a distance relative to it, that does not count
-_DROP = 0.1  # a label that loses more overlap is named
 _WORSE = 1 / 3  # share of labels or landmarks that may get worse
-_APART, _FAR = 0.1, 0.05  # mean Dice, and landmark distance over the diagonal of the image, of what is not the same
+_APART, _FAR = 0.2, 0.05  # mean Dice, and landmark distance over the diagonal of the image, of what is not the same
+# Images are much more alike where they correlate by the first, and the second share of what was missing is gone. Labels
+# whose mean Dice stays below the third, and does not gain the fourth (look) or fifth (bad) share of what it lacks,
+# are of other images (own labels gained 0.15 and more, those of another person 0.11 and less).
+_ALIKE, _NEARER, _OVERLAP, _FOLLOWED, _STAYED = 0.85, 0.4, 0.7, 0.12, 0.08
 _PROVEN = 0.02  # gain of mean Dice, to at least 0.5, that outweighs images that are hard to compare
 
 
@@ -101,11 +104,12 @@ def judge(
     Notes:
         No figure proves that the right tissue is on the right tissue. Only labels, landmarks or a look can show it.
     """
-    known = list(_annotations(evaluation, evidence.label_contrast, grid, unit))
+    known = list(_annotations(evaluation, evidence, grid, unit))
     found = [*_folds(folds), *_images(evidence, grid.dim, mirror), *_map(evidence)]
     if evaluation is not None and _proven(evaluation) and all(some.kind == GOOD for some in known):
         found = [replace_bad(some) if some.kind == BAD and folds == 0 else some for some in found]
-    found += [*known, *(Finding(LOOK, f"{WARNED}{text}.") for text in warnings)]
+    others = [text for text in warnings if mirror <= _MIRROR or "mirror image" not in text]
+    found += [*known, *(Finding(LOOK, f"{WARNED}{text}.") for text in others)]
     found.sort(key=lambda some: _ORDER.index(some.kind))
     kind = found[0].kind
     return Verdict(kind, _HEADLINES[kind].format(_reason(found[0].text)), tuple(found))
@@ -140,7 +144,7 @@ def _images(evidence: Evidence, dim: int, mirror: float) -> Iterator[Finding]:
         yield Finding(kind, text, {"signs": len(signs), "structure_before": evidence.structure_before})
     if mirror > _MIRROR:
         text = "The moving image looks like a mirror image of the fixed one (mirrored it would fit "
-        text += f"{number(mirror)} times as well)."
+        text += f"{number(mirror)} times as well): check the directions in both headers."
         yield Finding(BAD if mirror > _MIRRORED else LOOK, text, {"mirror": mirror})
     if evidence.turned:
         axes = " and ".join(evidence.turned)
@@ -202,14 +206,13 @@ def _map(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(LOOK, text, {"inverse_error": e.inverse_error})
 
 
-def _annotations(
-    evaluation: Evaluation | None, contrast: tuple[float, float] | None, grid: Grid, unit: str
-) -> Iterator[Finding]:
+def _annotations(evaluation: Evaluation | None, evidence: Evidence, grid: Grid, unit: str) -> Iterator[Finding]:
     if evaluation is None:
         return
     if evaluation.after.labels:
-        yield from _own_images(contrast)
+        yield from _own_images(evidence.label_contrast)
         yield from _labels(evaluation)
+        yield from _left_behind(evaluation, evidence)
         yield from _surfaces(evaluation, grid, unit)
     distances = [stage.distances for stage in (evaluation.before, evaluation.after)]
     if distances[0] is not None and distances[1] is not None:
@@ -251,6 +254,18 @@ def _labels(evaluation: Evaluation) -> Iterator[Finding]:
         text = f"The alignment lowered the overlap of the labels (mean Dice {number(before)} → "
         aligned = _mean(evaluation.aligned.dice)
         yield Finding(LOOK, f"{text}{number(aligned)}).", {"dice_before": before, "dice_aligned": aligned})
+
+
+def _left_behind(evaluation: Evaluation, evidence: Evidence) -> Iterator[Finding]:
+    """Whether the deformation brought the images together, but not their labels."""
+    start, after = (_mean(stage.dice) for stage in (evaluation.aligned or evaluation.before, evaluation.after))
+    before, alike = evidence.correlation_before, evidence.correlation
+    nearer = alike >= _ALIKE and alike - before >= _NEARER * (1 - before)
+    gain = (after - start) / max(1 - start, _STEADY)
+    if nearer and after < _OVERLAP and gain < _FOLLOWED:
+        text = f"The images fit much better after the deformation, their labels do not (mean Dice {number(start)} → "
+        text += f"{number(after)}): are they of these images?"
+        yield Finding(BAD if gain < _STAYED else LOOK, text, {"dice_aligned": start, "dice_after": after})
 
 
 def _each_label(evaluation: Evaluation, means: str, figures: dict[str, float], better: bool) -> Iterator[Finding]:
