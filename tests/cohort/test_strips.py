@@ -74,3 +74,15 @@ def test_ten_thousand_pairs_are_not_much_larger_than_a_hundred():
         return len(strip.lines[0].dots) + 100 * len(strip.outliers)
 
     assert size(10_000) < 12_000
+
+
+def test_of_many_pairs_the_heights_are_shares():
+    values = {f"{k}": float(k % 4 == 0) for k in range(1000)}
+    found = places(strip_of([values], [0]).lines[0].dots)
+    assert [sum(x == at for x, _ in found) for at in (4, WIDTH - 4)] == [7, 3]
+
+
+def test_all_outliers_are_counted():
+    values = {f"{k}": float(k >= 900) for k in range(1000)}
+    strip = strip_of([values], [1])
+    assert (strip.far, len(strip.outliers), len(strip.named)) == (100, 40, 3)

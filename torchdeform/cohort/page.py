@@ -159,7 +159,7 @@ def _strip(measure: Measure, rows: Sequence[Row], links: Mapping[str, str]) -> d
         "lines": strip.lines,
         "marks": marks,
         "named": named,
-        "more": len({outlier.name for outlier in strip.outliers}) - len(named),
+        "more": strip.far - len(named),
     }
 
 

@@ -2,16 +2,16 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import quantiles
 
 WIDTH, ROW = 320, 34  # of a strip and of a row of dots, in units of the drawing
 _MARGIN, _DOT = 5.0, 4.0  # free space at either end, and the distance of neighbouring dots
-_MOST = 7  # dots above one another; more of them look the same
+_MOST = 7  # dots above one another
 _FEWEST, _FENCE = 5, 1.5  # pairs from which on there are outliers, and how far they are from the quartiles, in spreads
 _ORDERS = 20.0  # from which on a scale is logarithmic
-_NAMED, _MARKED = 3, 40  # outliers with their name, and with a mark of their own
+_NAMED, _MARKED = 3, 40  # outliers whose names are written, and with a mark of their own
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class Strip:
         height: of the drawing.
         log: whether the scale is logarithmic.
         lines: a row of dots for each column.
-        outliers: the worst come first.
-        named: those of them whose names are written.
+        outliers: those with a mark of their own, the worst first.
+        far: number of pairs that are outliers.
     """
 
     low: float
@@ -53,11 +53,15 @@ class Strip:
     log: bool
     lines: tuple[Line, ...]
     outliers: tuple[Outlier, ...]
+    far: int
 
     @property
     def named(self) -> tuple[Outlier, ...]:
-        """The worst outliers, each pair once."""
-        return tuple({outlier.name: outlier for outlier in reversed(self.outliers)}.values())[::-1][:_NAMED]
+        """The worst outliers, whose names are written, each pair once."""
+        worst: dict[str, Outlier] = {}
+        for outlier in self.outliers:
+            worst.setdefault(outlier.name, outlier)
+        return tuple(worst.values())[:_NAMED]
 
 
 def strip_of(columns: Sequence[Mapping[str, float]], worse: Sequence[int], *, ratios: bool = False) -> Strip:
@@ -75,16 +79,18 @@ def strip_of(columns: Sequence[Mapping[str, float]], worse: Sequence[int], *, ra
     low, high = min(every), max(every)
     log = ratios and 0 < low * _ORDERS < high
     place = _placement(low, high, log)
-    lines, found = [], list[tuple[float, Outlier]]()
+    lines, found, names = [], list[tuple[float, Outlier]](), set[str]()
     for k, (column, sign) in enumerate(zip(columns, worse, strict=True)):
-        places = {name: place(value) for name, value in column.items()}
-        y, box = ROW * (k + 0.5), _quartiles(list(places.values()))
+        y, places = ROW * (k + 0.5), {name: place(value) for name, value in column.items()}
+        box = _quartiles(list(places.values()))
         far = _outliers(places, box, sign)
-        found += [(how, Outlier(name, column[name], round(places[name], 1), y)) for name, how in far.items()]
-        dots = "".join(_dots((x for name, x in places.items() if name not in far), y))
-        lines.append(Line(dots, box, y))
+        marked = sorted(far, key=lambda name: -far[name])[:_MARKED]
+        found += [(far[name], Outlier(name, column[name], round(places[name], 1), y)) for name in marked]
+        others = (places[name] for name in places.keys() - set(marked))
+        lines.append(Line("".join(_dots(others, y)), box, y))
+        names |= far.keys()
     outliers = tuple(outlier for _, outlier in sorted(found, key=lambda pair: -pair[0]))
-    return Strip(low, high, ROW * len(columns), log, tuple(lines), outliers)
+    return Strip(low, high, ROW * len(columns), log, tuple(lines), outliers, len(names))
 
 
 def _placement(low: float, high: float, log: bool) -> Callable[[float], float]:
@@ -102,21 +108,19 @@ def _quartiles(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _outliers(column: Mapping[str, float], box: tuple[float, float, float], sign: int) -> dict[str, float]:
-    """Return by how much the worst outliers are beyond the quartile of their side, in spreads."""
+    """Return by how much outliers are beyond the quartile of their side, in spreads."""
     if len(column) < _FEWEST or sign == 0:
         return {}
     edge, spread = box[1 + sign], box[2] - box[0]
     beyond = {name: sign * (value - edge) for name, value in column.items()}
-    far = {name: how / (spread or 1.0) for name, how in beyond.items() if how > _FENCE * spread}
-    return dict(sorted(far.items(), key=lambda item: -item[1])[:_MARKED])
+    return {name: how / (spread or 1.0) for name, how in beyond.items() if how > _FENCE * spread}
 
 
-def _dots(places: Iterator[float], y: float) -> Iterator[str]:
-    """Yield dots of a path, those of one place above and below each other."""
-    count: Counter[float] = Counter()
-    for place in places:
-        x = round(place / _DOT) * _DOT
-        height, count[x] = count[x], count[x] + 1
-        if height < _MOST:
+def _dots(places: Iterable[float], y: float) -> Iterator[str]:
+    """Yield dots of a path, those of one place above and below each other; of many pairs a dot stands for several."""
+    counts = Counter(round(place / _DOT) * _DOT for place in places)
+    share = max(1.0, max(counts.values(), default=0) / _MOST)
+    for x, count in sorted(counts.items()):
+        for height in range(math.ceil(count / share)):
             shift = (height + 1) // 2 * _DOT * (-1) ** height
             yield f"M{x:g} {y + shift:g}h0"

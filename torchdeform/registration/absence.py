@@ -8,11 +8,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.core.grid import Grid, per_item
+from torchdeform.core.image import AUTO
 from torchdeform.core.intensities import fill
 from torchdeform.core.resampling import prolong, restrict, with_spacing
 from torchdeform.core.warp import warp
 from torchdeform.metrics.correlation import local_contrast
 from torchdeform.registration.problem import RegistrationProblem
+from torchdeform.registration.settings import RegistrationSettings
 
 # Regions are looked for on a grid of at most so many nodes to the power of D; narrower ones than 2 · radius + 1 of its
 # voxels are left to the map, which can close them.
@@ -31,11 +33,15 @@ _BORDER = 0.5
 _POOL = {2: F.max_pool2d, 3: F.max_pool3d}
 
 
-def let_go(problem: RegistrationProblem) -> tuple[RegistrationProblem, tuple[Tensor, Tensor] | None]:
+Regions = tuple[Tensor, Tensor]
+
+
+def let_go(problem: RegistrationProblem, settings: RegistrationSettings) -> tuple[RegistrationProblem, Regions | None]:
     """Return the problem without what only one image shows, and where the fixed and the moving image show nothing.
 
     Args:
         problem: images scaled to about [0, 1], in the place where the deformation begins.
+        settings: whether to.
 
     Returns:
         The problem with that left out of the masks and filled in, and two regions ``(B, 1, *S)`` of 0 and 1; None in
@@ -46,13 +52,16 @@ def let_go(problem: RegistrationProblem) -> tuple[RegistrationProblem, tuple[Ten
         to open as a whole, and the other has contrast throughout. Each region is fixed to the image that is empty
         there, so a map carries that of the moving image with it. Costs some passes over both images.
     """
-    regions = absent_regions(problem)
+    regions = absent_regions(problem) if settings.absent == AUTO else []
     if not any(bool(region.any()) for region in regions):
         return problem, None
-    kept = [1 - region for region in regions]
+    # What the moving image does not show goes along with it, and nothing is asked of the fixed one there: the tissue
+    # around would else be pulled into the hole. Where both are warped, both ask nothing of each other.
+    both = torch.maximum(*regions)
+    kept = [1 - both, 1 - (both if settings.symmetric else regions[1])]
     given = (problem.fixed_mask, problem.moving_mask)
     masks = [keep if mask is None else keep * mask for keep, mask in zip(kept, given, strict=True)]
-    images = [fill(image, keep) for image, keep in zip((problem.fixed, problem.moving), kept, strict=True)]
+    images = [fill(x, 1 - region) for x, region in zip((problem.fixed, problem.moving), regions, strict=True)]
     problem = replace(problem, fixed=images[0], moving=images[1], fixed_mask=masks[0], moving_mask=masks[1])
     return problem, (regions[0], regions[1])
 
@@ -77,9 +86,9 @@ def absent_regions(problem: RegistrationProblem) -> list[Tensor]:
     return found
 
 
-def moved_with(regions: tuple[Tensor, Tensor], u: Tensor, grid: Grid) -> Tensor:
+def moved_with(regions: Regions | None, u: Tensor, grid: Grid) -> Tensor | None:
     """Return where the similarity was let go on the fixed grid ``(B, 1, *S)``, 0 to 1, after the map u."""
-    return torch.maximum(regions[0], warp(regions[1], u, grid))
+    return None if regions is None else torch.maximum(torch.maximum(*regions), warp(regions[1], u, grid))
 
 
 def _coarse(grid: Grid) -> Grid:

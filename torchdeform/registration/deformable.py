@@ -18,6 +18,7 @@ from torchdeform.core.warp import invert, warp
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.metrics.evaluation import evaluate_images, evaluate_tensors
 from torchdeform.metrics.similarity import mark
+from torchdeform.registration.absence import let_go, moved_with
 from torchdeform.registration.agreement import disagreement
 from torchdeform.registration.discrete import discrete_start
 from torchdeform.registration.evidence import gather_evidence, to_compare, with_labels
@@ -106,14 +107,15 @@ def _register_tensors(
     problem = problem_of_tensors(fixed, moving, grid, annotations)
     require_finite(problem.fixed, problem.moving, "register")
     settings = settings.decided()  # items of a batch may not choose for each other
-    problem = problem.scaled(settings)
+    problem, regions = let_go(problem.scaled(settings), settings)
     space = midspace_of_tensors(problem) if settings.symmetric else None
     found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
     del problem, space
     with limit_threads(len(found.u), grid):
         warped = warp(moving, found.u, grid)
         evaluation = evaluate_tensors(found.u, grid, labels=annotations.labels, points=annotations.points)
-    result = replace(_result(found, grid, warped, settings), evaluation=evaluation)
+    absent = moved_with(regions, found.u, grid)
+    result = replace(_result(found, grid, warped, settings), evaluation=evaluation, absent=absent)
     return _examined(result, compared, (fixed, moving), annotations.labels)
 
 
@@ -166,7 +168,7 @@ def _register_images(
     annotations.require_images(fixed.grid.dim)
     placed = affine if isinstance(affine, Placement) else place(fixed, moving, settings, annotations, affine)
     both, settings, affine = placed_images(fixed, moving, annotations), placed.settings, placed.affine
-    problem = problem_at(*both, affine).scaled(settings)
+    problem, regions = let_go(problem_at(*both, affine).scaled(settings), settings)
     space = _midspace(*both, problem, affine, settings) if settings.symmetric else None
     found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
     del problem, space
@@ -178,6 +180,7 @@ def _register_images(
         alignment=alignment,
         warnings=alignment.warnings if alignment else (),
         unit=fixed.unit,
+        absent=moved_with(regions, found.u, fixed.grid),
         choice=placed.choice,
         similarity_before=result.similarity_before if placed.unaligned is None else placed.unaligned,
         similarity_aligned=result.similarity_before if alignment else None,
@@ -200,7 +203,7 @@ def _midspace(
     if affine is None and same_place(fixed.image, moving.image):
         return midspace_of_tensors(problem)
     space = midspace_of_images(fixed, moving, affine, common_axes(fixed.image, moving.image))
-    return replace(space, problem=space.problem.scaled(settings))
+    return replace(space, problem=let_go(space.problem.scaled(settings), settings)[0])
 
 
 def _warped(fixed: Image, moving: Image, affine: Affine | None, u: Tensor, settings: RegistrationSettings) -> Tensor:
@@ -325,6 +328,7 @@ def resample_result(
         displacement=u,
         inverse=inverse,
         grid=grid,
+        absent=None if result.absent is None else prolong(result.absent, grid),
         warped=_warped(fixed, moving, result.affine, u, result.settings),
         diagnosis=diagnose(u, grid),
         inverse_error_mean=mean,

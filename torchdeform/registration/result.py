@@ -84,6 +84,7 @@ class RegistrationResult:
         evaluation: what labels and landmarks say; None without them.
         similarity_aligned: the mark after the alignment ``(B,)``, over the voxels of ``similarity_after``; None where
             nothing was aligned.
+        absent: where the similarity was let go, as nothing corresponds ``(B, 1, *S)``, from 0 to 1; None if nowhere.
         choice: a sentence on the similarity that was chosen; None where it was given.
         evidence: what the images and the map say, of each item.
         warnings: sentences about what looks wrong with the images.
@@ -108,6 +109,7 @@ class RegistrationResult:
     alignment: Alignment | None = None
     evaluation: Evaluation | None = None
     similarity_aligned: Tensor | None = None
+    absent: Tensor | None = None
     choice: str | None = None
     evidence: tuple[Evidence, ...] = ()
     warnings: tuple[str, ...] = ()

@@ -215,6 +215,8 @@ class RegistrationSettings:
         symmetric: prefer neither image: both are warped into a space between, so that swapping them inverts the map.
         outside: value of ``warped`` where an image (not a tensor) does not reach: a number, or ``auto`` for what
             surrounds it, the grey value of its border if that is nearly constant, else its minimum.
+        absent: ``auto`` lets the similarity go of what only one image shows (resected, torn off, cut off); ``off``
+            compares everything.
 
     Raises:
         InputError: a value out of range, named.
@@ -233,6 +235,7 @@ class RegistrationSettings:
     points_weight: float = 0.0
     symmetric: bool = False
     outside: float | str = AUTO
+    absent: str = AUTO
 
     def __post_init__(self) -> None:
         for name, key in SHORT_FORMS.items():
@@ -240,6 +243,7 @@ class RegistrationSettings:
             if isinstance(value, str | Mapping):
                 object.__setattr__(self, name, replace(_SHORT_DEFAULTS[name], **{key: value}))
         require_choice(self.start, STARTS, "start")
+        require_choice(self.absent, (AUTO, "off"), "absent")
         require_choice(self.stencil, STENCILS, "stencil")
         if isinstance(self.outside, str):
             require_choice(self.outside, (AUTO,), "outside, if it is no number,")
