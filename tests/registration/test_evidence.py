@@ -139,7 +139,8 @@ def test_images_without_anything_in_common_have_evidence():
     assert found.covered < 0.1
     assert found.correlation == 0
     nothing = evidence(fixed, fixed, moving_mask=torch.zeros_like(fixed))
-    assert (nothing.covered, nothing.information, nothing.foreground, nothing.edges) == (0, 0, 0, math.inf)
+    assert (nothing.covered, nothing.information, nothing.structure_before) == (0, 0, 0)
+    assert (nothing.foreground, nothing.edges) == (0, math.inf)
     assert evidence(torch.zeros_like(fixed) + 0.5, fixed).information == pytest.approx(0, abs=1e-6)
 
 

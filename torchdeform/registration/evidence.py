@@ -36,6 +36,7 @@ _LEVELS = 16  # grey levels that mutual information tells apart
 _LEAST = 0.05  # information of an image about itself that counts as none
 _BETTER = 0.2  # by so much more information a turned image has to fit better
 _ASKED = 500  # edges whose distance from those of the other image is measured, at most
+_LITTLE = 0.05  # share of what has contrast that is too little to compare
 _KNOWN = 0.5  # weight from which on a voxel counts
 _TINY = 1e-9
 
@@ -249,6 +250,8 @@ class Views:
 
     def structure(self) -> float:
         """Return 1 - D / (D of images pushed apart), D being the squared difference of their MIND features."""
+        if self.share(self.both) < _LITTLE:
+            return 0.0
         views = replace(self, fixed=mind_ssc(self.fixed), moving=mind_ssc(self.moving))
         away = [view._difference() for view in views.pushed()]
         return 1 - views._difference() / max(sum(away) / len(away), _TINY)
