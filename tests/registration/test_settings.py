@@ -35,3 +35,19 @@ def test_a_group_may_be_given_by_its_leading_value():
         RegistrationSettings(solver="asembled")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="stencil must be one of"):
         RegistrationSettings(stencil="shift")
+
+
+@pytest.mark.parametrize(("given", "kept"), [("off", "off"), (False, "off"), ("auto", "auto"), (True, "auto")])
+def test_off_may_be_written_as_yaml_reads_it(given, kept):
+    assert RegistrationSettings(absent=given).absent == kept
+    assert load_settings("default", overrides={"absent": given}).absent == kept
+
+
+def test_auto_is_decided_by_what_is_compared():
+    plain = RegistrationSettings().decided()
+    assert (plain.similarity.measure, plain.start) == ("lncc", "identity")
+    other = RegistrationSettings().decided("mind")
+    assert (other.similarity.measure, other.start) == ("mind", "discrete")
+    given = settings_of(similarity="mi").decided("mind")
+    assert (given.similarity.measure, given.start) == ("mi", "identity")
+    assert settings_of(similarity="mind", start="identity").decided().start == "identity"

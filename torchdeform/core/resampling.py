@@ -11,6 +11,9 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 
+# Factor by which voxels grow until a grid has few enough nodes.
+_COARSER = 1.05
+
 # Rows of a block: with fewer rows fewer of its entries are 0, but small products are slow. Two fields of 4096² on half
 # as many nodes an axis: 0.1 s, against 1.4 s when entries are taken one by one.
 _ROWS = {"cpu": 32, "cuda": 256}
@@ -322,6 +325,15 @@ def with_spacing(grid: Grid, spacing: float) -> Grid:
         n if h >= spacing else min(n, max(MIN_NODES, round(side / spacing) + 1))
         for n, h, side in zip(grid.shape, grid.spacing, grid.extent, strict=True)
     )
+
+
+def with_nodes(grid: Grid, most: int) -> Grid:
+    """Return the grid of the same box with no more than so many nodes, of about one spacing; itself if it has not."""
+    spacing, coarse = min(grid.spacing), grid
+    while math.prod(coarse.shape) > most:
+        spacing *= _COARSER
+        coarse = with_spacing(grid, spacing)
+    return coarse
 
 
 def restrict(image: Tensor, grid: Grid, coarse: Grid) -> Tensor:

@@ -1,6 +1,5 @@
 """Tissue that one image has and the other does not: resected, torn off, cut off; the similarity lets go of it."""
 
-import math
 from dataclasses import replace
 
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor
 from torchdeform.core.grid import Grid, per_item
 from torchdeform.core.image import AUTO
 from torchdeform.core.intensities import fill
-from torchdeform.core.resampling import prolong, restrict, with_spacing
+from torchdeform.core.resampling import prolong, restrict, with_nodes
 from torchdeform.core.warp import warp
 from torchdeform.metrics.correlation import local_contrast
 from torchdeform.registration.problem import RegistrationProblem
@@ -18,7 +17,7 @@ from torchdeform.registration.settings import RegistrationSettings
 
 # Regions are looked for on a grid of at most so many nodes to the power of D; narrower ones than 2 · radius + 1 of its
 # voxels are left to the map, which can close them.
-_NODES, _COARSER, _RADIUS = 64, 1.05, 2
+_NODES, _RADIUS = 64, 2
 
 # Of images scaled to [0, 1], voxels this near to the background show nothing, and those this far from it tissue, if
 # windows of this width around them have this standard deviation.
@@ -69,7 +68,9 @@ def let_go(problem: RegistrationProblem, settings: RegistrationSettings) -> tupl
 def absent_regions(problem: RegistrationProblem) -> list[Tensor]:
     """Return where the fixed image is empty and the moving one is not, and the other way round, ``(B, 1, *S)``."""
     grid, images = problem.grid, (problem.fixed, problem.moving)
-    coarse = _coarse(grid)
+    if not any(bool(_border(image)[1].any()) for image in images):  # soon known, and usual for crops
+        return [torch.zeros_like(image[:, :1]) for image in images]
+    coarse = with_nodes(grid, _NODES**grid.dim)
     empty = [_background(image, _EMPTY) for image in images]
     shares = [restrict(region, grid, coarse) for region in empty]
     tissue = [_tissue(restrict(image, grid, coarse)) for image in images]
@@ -91,21 +92,17 @@ def moved_with(regions: Regions | None, u: Tensor, grid: Grid) -> Tensor | None:
     return None if regions is None else torch.maximum(torch.maximum(*regions), warp(regions[1], u, grid))
 
 
-def _coarse(grid: Grid) -> Grid:
-    """Return the finest grid of the same box, or the grid itself, with few enough nodes."""
-    size, coarse = min(grid.spacing), grid
-    while math.prod(coarse.shape) > _NODES**grid.dim:
-        size *= _COARSER
-        coarse = with_spacing(grid, size)
-    return coarse
+def _border(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the grey value of the border ``(B, C)``, and whether most of it has that value ``(B,)``."""
+    faces = [image.select(axis, end).flatten(2) for axis in range(2, image.dim()) for end in (0, -1)]
+    border = torch.cat(faces, dim=2)
+    level = border.median(dim=2).values
+    return level, ((border - level.unsqueeze(2)).abs().amax(1) < _EMPTY).to(image).mean(1) > _BORDER
 
 
 def _background(image: Tensor, within: float) -> Tensor:
     """Return where all channels are as the border is ``(B, 1, *S)``; nowhere if the border is not of one value."""
-    faces = [image.select(axis, end).flatten(2) for axis in range(2, image.dim()) for end in (0, -1)]
-    border = torch.cat(faces, dim=2)
-    level = border.median(dim=2).values
-    pure = ((border - level.unsqueeze(2)).abs().amax(1) < _EMPTY).to(image).mean(1) > _BORDER
+    level, pure = _border(image)
     away = (image - level.view(*level.shape, *[1] * (image.dim() - 2))).abs().amax(1, keepdim=True)
     return (away < within).to(image) * per_item(pure.to(image), image)
 

@@ -1,14 +1,12 @@
 """Where a deformation begins: the alignment, kept only where it helps, and the similarity that suits both images."""
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from torchdeform.core.grid import Grid
 from torchdeform.core.image import AUTO, Image, overlap
-from torchdeform.core.resampling import box_sum, with_spacing
+from torchdeform.core.resampling import box_sum, with_nodes
 from torchdeform.core.stages import begin
 from torchdeform.core.transform import Affine
 from torchdeform.errors import InputError
@@ -22,8 +20,8 @@ from torchdeform.registration.settings import RegistrationSettings
 _GAIN = 1e-4
 
 # Local correlations are compared on at most so many nodes to the power of D, in windows of so many, which count half
-# where their standard deviation is a grey level of 3 %; voxels grow by a factor until the nodes are few enough.
-_NODES, _WINDOW, _CLEAR, _COARSER = 128, 9, 0.03, 1.05
+# where their standard deviation is a grey level of 3 %.
+_NODES, _WINDOW, _CLEAR = 128, 9, 0.03
 
 # Share of one sign in the local correlations from which on both images have one contrast. On the pairs of one contrast
 # in docs/accuracy.md it is 0.92 and more, in two contrasts 0.09 to 0.45 (spine T1 and T2, brain maps painted as both).
@@ -138,7 +136,7 @@ def sign_agreement(problem: RegistrationProblem) -> float:
     Args:
         problem: images scaled to about [0, 1]; a batch is taken as one.
     """
-    problem = problem.on(_coarse(problem.grid))
+    problem = problem.on(with_nodes(problem.grid, _NODES**problem.grid.dim))
     images = problem.fixed, problem.moving
     count = box_sum(torch.ones_like(problem.fixed[:1, :1]), _WINDOW)
     means = [box_sum(image, _WINDOW) / count for image in images]
@@ -148,12 +146,3 @@ def sign_agreement(problem: RegistrationProblem) -> float:
     weight = contrast(spread[0], _CLEAR) * contrast(spread[1], _CLEAR)
     weight = weight if problem.mask is None else weight * problem.mask
     return float((weight * r).sum().abs() / (weight * r.abs()).sum().clamp(min=torch.finfo(r.dtype).tiny))
-
-
-def _coarse(grid: Grid) -> Grid:
-    """Return the finest grid of the same box, or the grid itself, with few enough nodes."""
-    size, coarse = min(grid.spacing), grid
-    while math.prod(coarse.shape) > _NODES**grid.dim:
-        size *= _COARSER
-        coarse = with_spacing(grid, size)
-    return coarse

@@ -11,6 +11,7 @@ from torchdeform.fem.solver import SolverSettings
 from torchdeform.metrics.similarity import similarity_weights
 from torchdeform.registration.affine.settings import AlignmentSettings
 
+OFF = "off"
 STARTS = (AUTO, "identity", "discrete")
 STENCILS = ("auto", "convolution", "shifts")
 
@@ -235,7 +236,7 @@ class RegistrationSettings:
     points_weight: float = 0.0
     symmetric: bool = False
     outside: float | str = AUTO
-    absent: str = AUTO
+    absent: str | bool = AUTO
 
     def __post_init__(self) -> None:
         for name, key in SHORT_FORMS.items():
@@ -243,7 +244,9 @@ class RegistrationSettings:
             if isinstance(value, str | Mapping):
                 object.__setattr__(self, name, replace(_SHORT_DEFAULTS[name], **{key: value}))
         require_choice(self.start, STARTS, "start")
-        require_choice(self.absent, (AUTO, "off"), "absent")
+        if isinstance(self.absent, bool):  # which YAML makes of a plain off
+            object.__setattr__(self, "absent", AUTO if self.absent else OFF)
+        require_choice(self.absent, (AUTO, OFF), "absent")
         require_choice(self.stencil, STENCILS, "stencil")
         if isinstance(self.outside, str):
             require_choice(self.outside, (AUTO,), "outside, if it is no number,")
