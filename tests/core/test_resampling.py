@@ -1,5 +1,6 @@
 """Banded matrices against torch's own interpolation, padding and convolution, and against the dense matrix."""
 
+import math
 from itertools import pairwise
 from unittest import mock
 
@@ -28,6 +29,7 @@ from torchdeform.core.resampling import (
     pyramid_grids,
     restrict,
     restriction,
+    with_nodes,
 )
 
 LIKE = torch.zeros(0, dtype=torch.float64)
@@ -198,3 +200,11 @@ def test_a_constant_force_stays_what_it_is_inside(transfer):
     inner = (..., *[slice(2, -2)] * transfer.fine.dim)
     found = transfer.gather(torch.ones(1, 1, *transfer.fine.shape, dtype=torch.float64))[inner]
     torch.testing.assert_close(found.mean(), torch.ones((), dtype=torch.float64), rtol=0.02, atol=0)
+
+
+def test_grids_have_few_nodes_of_one_spacing():
+    coarse = with_nodes(Grid((300, 200, 20), (1.0, 1.0, 5.0)), 4096)
+    assert math.prod(coarse.shape) <= 4096
+    assert coarse.extent == pytest.approx((299, 199, 95))
+    assert max(coarse.spacing) < 1.6 * min(coarse.spacing)
+    assert with_nodes(Grid((10, 12)), 4096) == Grid((10, 12))

@@ -64,6 +64,14 @@ def test_images_of_different_things_are_not_let_go_as_a_whole():
     assert let_go(problem_of(left, right), RegistrationSettings())[1] is None
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+def test_what_is_displaced_is_not_absent(shape):
+    """One image is empty on one side, the other on the other side: that is motion, which the map has to find."""
+    whole = head(shape)
+    moved = whole.roll(tuple(n // 8 for n in shape), tuple(range(2, 2 + len(shape))))
+    assert let_go(problem_of(whole, moved), RegistrationSettings())[1] is None
+
+
 def test_each_item_of_a_batch_has_its_own_region():
     whole, cut = head((120, 112)), hole((120, 112))
     found = absent_regions(problem_of(torch.cat([whole, whole * (1 - cut)]), torch.cat([whole, whole])))

@@ -15,7 +15,6 @@ from torchdeform.registration.evidence import (
     gather_evidence,
     label_contrast,
     otsu,
-    smaller,
     to_compare,
     with_labels,
 )
@@ -142,14 +141,6 @@ def test_images_without_anything_in_common_have_evidence():
     assert (nothing.covered, nothing.information, nothing.structure_before) == (0, 0, 0)
     assert (nothing.foreground, nothing.edges) == (0, math.inf)
     assert evidence(torch.zeros_like(fixed) + 0.5, fixed).information == pytest.approx(0, abs=1e-6)
-
-
-def test_grids_have_few_nodes_of_one_spacing():
-    coarse = smaller(Grid((300, 200, 20), (1.0, 1.0, 5.0)), 4096)
-    assert math.prod(coarse.shape) <= 4096
-    assert coarse.extent == pytest.approx((299, 199, 95))
-    assert max(coarse.spacing) < 1.6 * min(coarse.spacing)
-    assert smaller(Grid((10, 12)), 4096) == Grid((10, 12))
 
 
 def test_labels_explain_their_own_image():

@@ -28,7 +28,7 @@ def test_only_large_levels_carry_a_coarser_map(monkeypatch):
 @pytest.mark.parametrize("symmetric", [False, True])
 @pytest.mark.parametrize("shape", [(80, 96), (32, 40, 36)])
 def test_a_coarser_map_finds_the_motion_without_folds(monkeypatch, shape, symmetric):
-    monkeypatch.setattr(levels, "_LARGE", 100)
+    monkeypatch.setattr(levels, "_LARGE", 4096)
     grid = Grid(shape)
     truth, moving = bend(grid, 3.0), blobs(shape)
     settings = settings_of(steps=(60, 60, 40), window=7, symmetric=symmetric)

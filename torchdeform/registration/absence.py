@@ -26,6 +26,9 @@ _EMPTY, _FULL, _WINDOW, _TEXTURE = 0.03, 0.1, 5, 0.03
 # Of more than this share of the tissue it is not believed that it is absent: the images are not aligned then.
 _MOST = 0.35
 
+# Nor where the other image is empty at other places over more than this share of it: things are displaced then.
+_BACK = 0.2
+
 # Share of the border that must have one value for it to be that of the background.
 _BORDER = 0.5
 
@@ -77,13 +80,13 @@ def absent_regions(problem: RegistrationProblem) -> list[Tensor]:
     if problem.mask is not None:
         seen = (restrict(problem.mask, grid, coarse) > 0.5).to(problem.fixed)
         tissue = [region * seen for region in tissue]
+    cores = [_opened((share > 0.5) * other) for share, other in zip(shares, reversed(tissue), strict=True)]
+    sizes = [core.flatten(1).sum(1) for core in cores]
     found = []
-    for share, full, other in zip(shares, empty, reversed(tissue), strict=True):
-        core = _opened((share > 0.5) * other)
-        part = core.flatten(1).sum(1) / other.flatten(1).sum(1).clamp(min=1)
-        core = core * per_item((part < _MOST).to(core), core)
-        near = prolong(_dilated(core, 2 * _RADIUS), grid) > 0.5
-        found.append(full * near)
+    for k, (full, other) in enumerate(zip(empty, reversed(tissue), strict=True)):
+        believed = (sizes[k] < _MOST * other.flatten(1).sum(1)) & (sizes[1 - k] <= _BACK * sizes[k])
+        core = cores[k] * per_item(believed.to(full), full)
+        found.append(full * (prolong(_dilated(core, 2 * _RADIUS), grid) > 0.5))
     return found
 
 

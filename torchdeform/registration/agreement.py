@@ -8,8 +8,9 @@ from torch import Tensor
 
 from torchdeform.core.fold_free import where_items
 from torchdeform.core.grid import Grid, limit_threads
+from torchdeform.core.resampling import with_nodes
 from torchdeform.core.warp import warp
-from torchdeform.registration.evidence import ROUGH, Views, smaller
+from torchdeform.registration.evidence import ROUGH, Views
 from torchdeform.registration.optimise import forward_objective, make_level
 from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.settings import MetricSettings, RegistrationSettings, SimilaritySettings
@@ -42,7 +43,7 @@ def disagreement(problem: RegistrationProblem, settings: RegistrationSettings) -
         Images that show the same pull both maps to the same place; others have many optima, and each direction finds
         its own. Both are items of one batch on a grid of few nodes: 30 ms in 2D, 50 ms in 3D.
     """
-    rough = problem.on(smaller(problem.grid, ROUGH[problem.grid.dim]))
+    rough = problem.on(with_nodes(problem.grid, ROUGH[problem.grid.dim]))
     grid = Grid(rough.grid.shape)  # in voxels
     both = RegistrationProblem(grid, *_there_and_back(rough.fixed, rough.moving), *_masks(rough))
     with limit_threads(1, grid):

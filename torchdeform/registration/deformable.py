@@ -129,8 +129,8 @@ def _examined(
     begin("judging")
     began = perf_counter()
     maps = (result.displacement, result.inverse, result.grid)
-    absent, apart = getattr(result, "absent", None), disagreement(compared, result.settings)
-    evidence = gather_evidence(compared, *maps, disagreement=apart, absent=absent)
+    apart = disagreement(compared, result.settings)
+    evidence = gather_evidence(compared, *maps, disagreement=apart, absent=result.absent)
     if labels is not None:
         evidence = with_labels(evidence, images, labels)
     return replace(result, evidence=evidence, seconds=result.seconds | {"judge": perf_counter() - began})

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchdeform.core.derivatives import by_slabs, derivative, jacobian_determinant
 from torchdeform.core.grid import Grid, limit_threads
-from torchdeform.core.resampling import box_sum, prolong, restrict, with_spacing
+from torchdeform.core.resampling import box_sum, prolong, restrict, with_nodes
 from torchdeform.core.warp import sample, voxels, warp
 from torchdeform.metrics.correlation import contrast, lncc
 from torchdeform.metrics.mind import mind_ssc
@@ -21,7 +21,6 @@ from torchdeform.registration.problem import RegistrationProblem
 # their edges are. On finer grids than the first, a map fits any texture to any other.
 ROUGH = {2: 1600, 3: 4096}
 _DETAIL = {2: 20_000, 3: 30_000}
-_COARSER = 1.05  # factor by which voxels grow until a grid has few enough nodes
 _WINDOW = 7  # width of the windows that are correlated, in voxels
 
 # What similarity is measured against: the moving image pushed along each axis by these shares of the box.
@@ -95,17 +94,8 @@ def to_compare(problem: RegistrationProblem) -> RegistrationProblem:
     """Return one channel of a problem on a grid of few nodes and on the CPU, all that `gather_evidence` needs."""
     grey = {name: getattr(problem, name).mean(1, keepdim=True) for name in ("fixed", "moving")}
     few = replace(problem, **grey, fixed_points=None, moving_points=None)
-    few = few.on(smaller(problem.grid, _DETAIL[problem.grid.dim]))
+    few = few.on(with_nodes(problem.grid, _DETAIL[problem.grid.dim]))
     return replace(few, **{name: None if field is None else field.cpu() for name, field in _fields(few).items()})
-
-
-def smaller(grid: Grid, nodes: int) -> Grid:
-    """Return the grid of the same box that has no more than so many nodes, of about the same spacing on every axis."""
-    spacing, found = min(grid.spacing), grid
-    while math.prod(found.shape) > nodes:
-        spacing *= _COARSER
-        found = with_spacing(grid, spacing)
-    return found
 
 
 @torch.no_grad()
@@ -160,7 +150,7 @@ def _part(field: Tensor, index: int) -> Tensor:
 def _of_item(
     problem: RegistrationProblem, u: Tensor, inverse: Tensor, grid: Grid, disagreement: float, absent: Tensor | None
 ) -> Evidence:
-    rough = problem.on(smaller(problem.grid, ROUGH[grid.dim]))
+    rough = problem.on(with_nodes(problem.grid, ROUGH[grid.dim]))
     before, after = Views.of(rough), Views.of(rough, u)
     start, end = Views.of(problem), Views.of(problem, u)
     information, turned = before.turned()

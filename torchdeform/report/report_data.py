@@ -118,7 +118,7 @@ def make_report_data(
 
 def _known(sampler: PairSampler, result: RegistrationResult, annotations: Annotations) -> Known:
     """Return what is drawn besides the images."""
-    absent = getattr(result, "absent", None)
+    absent = result.absent
     absent = None if absent is None else absent.detach().cpu()
     landmarks = landmarks_of(sampler.fixed, result, annotations)
     alike = set(similarity_weights(result.settings.similarity.measure)) <= _OF_ONE_CONTRAST
