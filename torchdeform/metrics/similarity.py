@@ -51,6 +51,7 @@ class Measure:
         time: time of a step over that of a step with LNCC.
         options: what both take of ``window`` (width in voxels) and ``grid``.
         features: what of the images is compared.
+        best: S of an image with itself; None where it depends on the image.
         unrelated: returns S of features that have nothing to do with each other, from those of both images
             ``(B, C', *S)``, their weight and S of the fixed ones with themselves; see `mark`.
         weighs_contrast: whether S itself leaves out what has no contrast in the fixed image.
@@ -64,7 +65,8 @@ class Measure:
     time: float
     options: tuple[str, ...] = ()
     features: Features = INTENSITIES
-    unrelated: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor] = lambda fixed, warped, weight, own: 0 * own
+    best: float | None = None
+    unrelated: Callable[[Tensor, Tensor, Tensor | None, Tensor], Tensor] = lambda fixed, warped, weight, own: 0 * own
     weighs_contrast: bool = False
     common_scale: bool = False
     references: tuple[str, ...] = ()
@@ -86,7 +88,7 @@ def _sparse_lncc(fixed: Tensor, window: int) -> Similarity:
     return LocalCrossCorrelation(fixed, window, max(1, window // _WINDOWS_OVER))
 
 
-def _variances(fixed: Tensor, warped: Tensor, weight: Tensor, own: Tensor) -> Tensor:
+def _variances(fixed: Tensor, warped: Tensor, weight: Tensor | None, own: Tensor) -> Tensor:
     """Return −E |f − Ef + Ew − w|² − |Ef − Ew|² of independent f and w."""
     share = relative_weight(weight, fixed)
     middles = [channel_mean(x, share) for x in (fixed, warped)]
@@ -100,10 +102,17 @@ _MI_PAPERS = ("viola1997alignment", "thevenaz2000optimization")
 # The one table of measures, by their names in settings: settings, layers, memory, time and citations all read it, so a
 # new measure is a new row.
 MEASURES = {
-    "ssd": Measure(ssd, MeanSquaredDifference, (60.0, 55.0), 0.7, unrelated=_variances, common_scale=True),
+    "ssd": Measure(ssd, MeanSquaredDifference, (60.0, 55.0), 0.7, best=0.0, unrelated=_variances, common_scale=True),
     "ncc": Measure(ncc, CrossCorrelation, (60.0, 55.0), 0.7),
     "lncc": Measure(
-        lncc, _sparse_lncc, (45.0, 40.0), 1.0, ("window",), weighs_contrast=True, references=("avants2008symmetric",)
+        lncc,
+        _sparse_lncc,
+        (45.0, 40.0),
+        1.0,
+        ("window",),
+        best=1.0,
+        weighs_contrast=True,
+        references=("avants2008symmetric",),
     ),
     "mi": Measure(mutual_information, MutualInformation, (60.0, 50.0), 1.1, references=_MI_PAPERS),
     "nmi": Measure(
@@ -129,6 +138,7 @@ MEASURES = {
         (140.0, 300.0),
         1.5,
         features=SELF_SIMILARITIES,
+        best=0.0,
         unrelated=_variances,
         references=("heinrich2013towards",),
     ),
@@ -275,13 +285,16 @@ def mark(
         concordance correlation of Lin, "A concordance correlation coefficient to evaluate reproducibility", 1989.
     """
     grid, total = grid or Grid(tuple(fixed.shape[2:])), fixed.new_zeros(len(fixed))
-    seen = weighted(local_contrast(fixed, window), mask)
+    seen = None
     for name, share in similarity_weights(similarity).items():
         measure = MEASURES[name]
+        if not measure.weighs_contrast and seen is None:
+            seen = weighted(local_contrast(fixed, window), mask)
+        weight = mask if measure.weighs_contrast else seen
         f, w = (measure.features.of(image) for image in (fixed, warped))
-        weight = (torch.ones_like(seen) if mask is None else mask) if measure.weighs_contrast else seen
         made = measure.closed_form(f, **measure.choose(window=window, grid=grid))
-        value, own = (made.evaluate(x, weight)[0] for x in (w, f))
+        value = made.evaluate(w, weight)[0]
+        own = made.evaluate(f, weight)[0] if measure.best is None else torch.full_like(value, measure.best)
         unrelated = measure.unrelated(f, w, weight, own)
         total += share * (value - unrelated) / (own - unrelated).clamp(min=torch.finfo(own.dtype).tiny)
     return total / sum(similarity_weights(similarity).values())

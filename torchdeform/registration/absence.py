@@ -32,9 +32,6 @@ _BACK = 0.2
 # Share of the border that must have one value for it to be that of the background.
 _BORDER = 0.5
 
-_POOL = {2: F.max_pool2d, 3: F.max_pool3d}
-
-
 Regions = tuple[Tensor, Tensor]
 
 
@@ -121,5 +118,9 @@ def _opened(region: Tensor) -> Tensor:
 
 
 def _dilated(region: Tensor, radius: int) -> Tensor:
-    """Return the union of all cubes of that radius around the region."""
-    return _POOL[region.dim() - 2](region, 2 * radius + 1, 1, radius)
+    """Return the union of all cubes of that radius around the region, axis by axis."""
+    for axis in range(2, region.dim()):
+        lines = region.movedim(axis, -1)
+        pooled = F.max_pool1d(lines.reshape(-1, 1, lines.shape[-1]), 2 * radius + 1, 1, radius)
+        region = pooled.view(lines.shape).movedim(-1, axis)
+    return region
