@@ -246,10 +246,10 @@ def _optimise(
     with limit_threads(len(u), problem.grid):
         objective = forward_objective(problem, problem.grid, settings)
         zero = torch.zeros_like(u)
-        u = best_map(objective, settings, u, *([] if start is None else [start]), zero)
-        values = objective.similarity.on_common_voxels([zero, u])
+        u, after, before = best_map(objective, settings, u, *([] if start is None else [start]), zero)
+        values = before, after
         marks = values if settings.similarity.measure == "lncc" else _marks(problem, settings, zero, u)
-    return _Optimised(u, records, tuple(values), tuple(marks), perf_counter() - began)
+    return _Optimised(u, records, values, marks, perf_counter() - began)
 
 
 def _marks(problem: RegistrationProblem, settings: RegistrationSettings, *maps: Tensor) -> tuple[Tensor, ...]:

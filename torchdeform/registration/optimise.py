@@ -235,7 +235,7 @@ def optimise_levels(
         with limit_threads(len(u), grid):
             state = optimise_level(level, u, callback)
             checked = level.objective.similarity.masks is not None  # all voxels count in all maps without
-            u = best_map(level.objective, settings, state.best, u, level=level) if checked else state.best
+            u = best_map(level.objective, settings, state.best, u, level=level)[0] if checked else state.best
         records.append(LevelRecord(level.shape, state.values, state.shortened, perf_counter() - began))
     if u is None:
         raise InputError("register: optimiser.steps must hold one number per level")
@@ -294,26 +294,29 @@ def optimise_level(
     return state
 
 
-def best_map(objective: Objective, settings: RegistrationSettings, *maps: Tensor, level: Level | None = None) -> Tensor:
-    """Return for each item the map with the highest goal over the same voxels, the last of equal ones.
+def best_map(
+    objective: Objective, settings: RegistrationSettings, *maps: Tensor, level: Level | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return for each item the map with the highest goal over the same voxels, its similarity, and that of the last.
 
     A map that moves what does not fit out of the image, or out of the mask, would else seem better than it is.
 
     Args:
         objective: what counts.
         settings: the settings.
-        maps: displacements ``(B, D, *S)``.
+        maps: displacements ``(B, D, *S)``; of equal ones the last is returned.
         level: whose maps they are; None for maps on the grid of the images.
     """
     values = objective.similarity.on_common_voxels([level.at_images(u) if level else u for u in maps])
+    goals = values
     if objective.landmarks:
         distances = [objective.landmarks.evaluate(u).distance for u in maps]
-        values = [v - settings.points_weight * d for v, d in zip(values, distances, strict=True)]
-    *others, (best, top) = zip(maps, values, strict=True)
-    for u, value in reversed(others):
-        better = value > top + _ROUNDING * value.abs()
-        best, top = where_items(better, u, best), where_items(better, value, top)
-    return best
+        goals = [v - settings.points_weight * d for v, d in zip(values, distances, strict=True)]
+    *others, (best, top, found) = zip(maps, goals, values, strict=True)
+    for u, goal, value in reversed(others):
+        better = goal > top + _ROUNDING * goal.abs()
+        best, top, found = (where_items(better, *pair) for pair in ((u, best), (goal, top), (value, found)))
+    return best, found, values[-1]
 
 
 def _step(level: Level, state: State, step: int) -> tuple[State, bool]:

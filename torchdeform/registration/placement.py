@@ -70,11 +70,11 @@ def place(
     if affine is None and settings.align.kind != "none":
         alignment = _align(fixed, moving, settings, annotations)
         affine = alignment.affine
-    problem = problem_at(*both, affine)
+    problem = problem_at(*both, affine).scaled(settings)
     settings, choice = choose(problem, settings)
     if alignment is None:
         return Placement(settings, affine, choice=choice)
-    unaligned, merit = _marked(problem_at(*both, None), settings) if overlap(fixed, moving) > 0 else (None, None)
+    unaligned, merit = _marked_as_they_are(*both, settings) if overlap(fixed, moving) > 0 else (None, None)
     if merit is not None and not bool(_marked(problem, settings)[1] > merit + _GAIN):
         kept = replace(alignment, affine=Affine.identity(fixed.grid.dim), start="geometry")
         alignment = replace(kept, similarity_after=alignment.similarity_before)
@@ -95,26 +95,34 @@ def problem_at(fixed: PlacedImage, moving: PlacedImage, affine: Affine | None) -
 
 
 def _marked(problem: RegistrationProblem, settings: RegistrationSettings) -> tuple[Tensor, Tensor]:
-    """Return mark and merit of two images, each ``(B,)``, 0 where they have no voxel in common."""
-    mask, nothing = problem.mask, problem.fixed.new_zeros(len(problem.fixed))
-    if mask is not None and not bool((mask > 0).flatten(1).any(1).all()):
-        return nothing, nothing
-    try:
-        scaled, chosen = problem.scaled(settings), settings.similarity
-    except InputError:  # the part of an image that is seen is constant
-        return nothing, nothing
-    found = mark(chosen.measure, scaled.fixed, scaled.moving, mask=mask, window=chosen.window, grid=problem.grid)
-    contrast = local_contrast(scaled.fixed, chosen.window)
+    """Return mark and merit of two images on their scale, each ``(B,)``."""
+    mask, chosen = problem.mask, settings.similarity
+    found = mark(chosen.measure, problem.fixed, problem.moving, mask=mask, window=chosen.window, grid=problem.grid)
+    contrast = local_contrast(problem.fixed, chosen.window)
     counted = contrast if problem.fixed_mask is None else contrast * problem.fixed_mask
     seen = contrast if mask is None else contrast * mask
     return found, found * (seen.flatten(1).sum(1) / counted.flatten(1).sum(1))
+
+
+def _marked_as_they_are(
+    fixed: PlacedImage, moving: PlacedImage, settings: RegistrationSettings
+) -> tuple[Tensor, Tensor]:
+    """Return mark and merit of two images where the files place them, 0 where they show nothing in common."""
+    problem = problem_at(fixed, moving, None)
+    nothing = problem.fixed.new_zeros(len(problem.fixed))
+    if problem.mask is not None and not bool(problem.mask.any()):
+        return nothing, nothing
+    try:
+        return _marked(problem.scaled(settings), settings)
+    except InputError:  # the part of an image that is seen is constant
+        return nothing, nothing
 
 
 def choose(problem: RegistrationProblem, settings: RegistrationSettings) -> tuple[RegistrationSettings, str | None]:
     """Return the settings with a similarity in place of ``auto``, and a sentence on the choice; None without one.
 
     Args:
-        problem: the images in the place where the deformation begins, in their own units.
+        problem: the images in the place where the deformation begins, scaled to about [0, 1].
         settings: what is asked for.
 
     Notes:
@@ -123,7 +131,7 @@ def choose(problem: RegistrationProblem, settings: RegistrationSettings) -> tupl
     """
     if settings.similarity.measure != AUTO:
         return settings.decided(), None
-    agreement = sign_agreement(problem.scaled(settings))
+    agreement = sign_agreement(problem)
     measure = "lncc" if agreement >= _ONE_CONTRAST else "mind"
     kind = "one contrast" if measure == "lncc" else "different contrasts"
     sentence = f"similarity {measure}: the images have {kind} (local correlations of one sign: {agreement:.0%})"

@@ -26,7 +26,7 @@ _SMALLEST = 1e-3  # smaller determinants, also of folds, are drawn as this
 _SHORTEST_SCALES = {"log_det": math.log(2), "inverse_error": 0.5}
 _BINS = 81
 _ALL = 130  # slices of all planes together that are shown if there are no more
-_MOST = 31  # slices of a plane otherwise
+_MOST = 21  # slices of a plane otherwise
 _OF_ONE_CONTRAST = {"lncc", "ncc", "ssd"}  # measures that are for such images
 _FEW = 5  # slices of a plane in a light report
 
@@ -94,7 +94,7 @@ def make_report_data(
         moving: moving image, at its own position.
         result: a result of one pair (batch of 1) on the fixed grid.
         annotations: labels, landmarks and masks to draw, those that were given to `register`.
-        slices: number of slices of each plane, at equal distances. When None, all that show something, or 31 of them.
+        slices: number of slices of each plane, at equal distances. When None, all that show something, or 21 of them.
             The middle one and that with the worst place are always among them.
         light: for a small page: few slices, no pictures of the map.
 
