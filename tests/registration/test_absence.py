@@ -72,6 +72,16 @@ def test_what_is_displaced_is_not_absent(shape):
     assert let_go(problem_of(whole, moved), RegistrationSettings())[1] is None
 
 
+def test_tissue_full_of_small_holes_is_not_absent():
+    """As that of lungs: most of its pixels are as empty as the background, but no place is."""
+    shape = (240, 240)
+    region = disc(shape, (120, 120), 90.0)
+    generator = torch.Generator().manual_seed(3)
+    walls = (torch.rand(1, 1, *shape, generator=generator) > 0.7).float()
+    solid = region * (0.5 + 0.1 * blobs(shape, 2))
+    assert let_go(problem_of(region * walls, solid), RegistrationSettings())[1] is None
+
+
 def test_each_item_of_a_batch_has_its_own_region():
     whole, cut = head((120, 112)), hole((120, 112))
     found = absent_regions(problem_of(torch.cat([whole, whole * (1 - cut)]), torch.cat([whole, whole])))

@@ -135,6 +135,7 @@ def summary(outcome: Outcome) -> str:
     marks = [f"{mark:.2f}" for mark in stages if mark is not None]
     lines = {
         f"similarity ({measure_name(r['similarity'])})": f"{' -> '.join(marks)} (1: the same)",
+        **({} if r["similarity_choice"] is None else {"chosen": r["similarity_choice"]}),
         "folds": folds_text(r),
         "inverse consistency": inverse_text(r["inverse_error_mean"], r["inverse_error_max"]),
         **_measured(r),

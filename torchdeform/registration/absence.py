@@ -29,6 +29,9 @@ _MOST = 0.35
 # Nor where the other image is empty at other places over more than this share of it: things are displaced then.
 _BACK = 0.2
 
+# Share of a voxel of that grid that has to be empty for it to be: lung tissue is full of holes.
+_PURE = 0.9
+
 # Share of the border that must have one value for it to be that of the background.
 _BORDER = 0.5
 
@@ -77,7 +80,7 @@ def absent_regions(problem: RegistrationProblem) -> list[Tensor]:
     if problem.mask is not None:
         seen = (restrict(problem.mask, grid, coarse) > 0.5).to(problem.fixed)
         tissue = [region * seen for region in tissue]
-    cores = [_opened((share > 0.5) * other) for share, other in zip(shares, reversed(tissue), strict=True)]
+    cores = [_opened((share > _PURE) * other) for share, other in zip(shares, reversed(tissue), strict=True)]
     sizes = [core.flatten(1).sum(1) for core in cores]
     found = []
     for k, (full, other) in enumerate(zip(empty, reversed(tissue), strict=True)):
