@@ -252,10 +252,18 @@ def _products(warped: Tensor, fixed: Tensor, weight: Tensor | None) -> Tensor:
 
 def local_contrast(image: Tensor, window: int, deviation: float = LNCC_CONTRAST) -> Tensor:
     """Return the largest `contrast` of all channels in the windows around each voxel, ``(B, 1, *S)``."""
-    count = box_sum(torch.ones_like(image[:1, :1]), window)
-    middle = box_sum(image, window) / count
-    variance = box_sum(image * image, window) / count - middle * middle
-    return contrast(variance.clamp(min=0).amax(1, keepdim=True), deviation)
+    return contrast(window_moments(image, window)[1].amax(1, keepdim=True), deviation)
+
+
+def window_moments(image: Tensor, window: int) -> tuple[Tensor, Tensor]:
+    """Return mean and variance of the part of the window around each voxel that is inside, both ``(B, C, *S)``."""
+    middle = window_mean(image, window)
+    return middle, (window_mean(image * image, window) - middle * middle).clamp(min=0)
+
+
+def window_mean(image: Tensor, window: int) -> Tensor:
+    """Return the mean of the part of the window around each voxel that is inside, ``(B, C, *S)``."""
+    return box_sum(image, window) / box_sum(torch.ones_like(image[:1, :1]), window)
 
 
 # Images are multiplied by this in `ForegroundLNCC`, so that ε is small against τ² and hardly a window is flat.

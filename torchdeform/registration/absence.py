@@ -11,6 +11,7 @@ from torchdeform.core.image import AUTO
 from torchdeform.core.intensities import fill
 from torchdeform.core.resampling import prolong, restrict, with_nodes
 from torchdeform.core.warp import warp
+from torchdeform.metrics.base import weighted
 from torchdeform.metrics.correlation import local_contrast
 from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.settings import RegistrationSettings
@@ -62,7 +63,7 @@ def let_go(problem: RegistrationProblem, settings: RegistrationSettings) -> tupl
     both = torch.maximum(*regions)
     kept = [1 - both, 1 - (both if settings.symmetric else regions[1])]
     given = (problem.fixed_mask, problem.moving_mask)
-    masks = [keep if mask is None else keep * mask for keep, mask in zip(kept, given, strict=True)]
+    masks = [weighted(keep, mask) for keep, mask in zip(kept, given, strict=True)]
     images = [fill(x, 1 - region) for x, region in zip((problem.fixed, problem.moving), regions, strict=True)]
     problem = replace(problem, fixed=images[0], moving=images[1], fixed_mask=masks[0], moving_mask=masks[1])
     return problem, (regions[0], regions[1])

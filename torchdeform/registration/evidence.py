@@ -13,7 +13,7 @@ from torchdeform.core.derivatives import by_slabs, derivative, jacobian_determin
 from torchdeform.core.grid import Grid, limit_threads
 from torchdeform.core.resampling import box_sum, prolong, restrict, with_nodes
 from torchdeform.core.warp import sample, voxels, warp
-from torchdeform.metrics.correlation import contrast, lncc
+from torchdeform.metrics.correlation import lncc, local_contrast
 from torchdeform.metrics.mind import mind_ssc
 from torchdeform.registration.problem import RegistrationProblem
 
@@ -217,7 +217,7 @@ class Views:
             moving, second = (
                 warp(field, w, problem.grid, outside=outside) for field, outside in ((moving, None), (second, 0.0))
             )
-        return cls(problem.grid, problem.fixed, moving, first, second, contrast(_variance(problem.fixed)) * first)
+        return cls(problem.grid, problem.fixed, moving, first, second, local_contrast(problem.fixed, _WINDOW) * first)
 
     @property
     def both(self) -> Tensor:
@@ -298,12 +298,6 @@ class Views:
             return 0.0
         first, second = (image[known] > otsu(image[known]) for image in (self.fixed, self.moving))
         return float(2 * (first & second).sum() / (first.sum() + second.sum()).clamp(min=1))
-
-
-def _variance(image: Tensor) -> Tensor:
-    count = box_sum(torch.ones_like(image), _WINDOW)
-    mean = box_sum(image, _WINDOW) / count
-    return (box_sum(image * image, _WINDOW) / count - mean * mean).clamp(min=0)
 
 
 def _joint_histogram(one: Tensor, other: Tensor) -> Tensor:

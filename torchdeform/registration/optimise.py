@@ -17,7 +17,7 @@ from torchdeform.core.grid import Grid, limit_threads, per_item
 from torchdeform.core.resampling import Transfer, coarsened, prolong, pyramid_grids
 from torchdeform.core.warp import compose, warp
 from torchdeform.errors import InputError
-from torchdeform.metrics.base import Similarity
+from torchdeform.metrics.base import Similarity, weighted
 from torchdeform.metrics.similarity import features, make_similarity
 from torchdeform.registration.landmarks import ForwardLandmarks, Landmarks
 from torchdeform.registration.problem import RegistrationProblem
@@ -86,8 +86,7 @@ class SimilarityTerm:
         if self.masks is None:
             return warped, *self.similarity.evaluate(warped, self.fixed_mask)
         warped, mask = warped.tensor_split([-1], dim=1)
-        mask = mask if self.fixed_mask is None else mask * self.fixed_mask
-        return warped, *self.similarity.evaluate(warped.contiguous(), mask)
+        return warped, *self.similarity.evaluate(warped.contiguous(), weighted(mask, self.fixed_mask))
 
     def on_common_voxels(self, maps: Sequence[Tensor]) -> list[Tensor]:
         """Return S of the images warped by each of the maps ``(B, D, *S)``, over the voxels that all of them see."""
@@ -102,9 +101,11 @@ class SimilarityTerm:
 
 def common_mask(fixed: Tensor | None, moving: Tensor | None, maps: Sequence[Tensor], grid: Grid) -> Tensor | None:
     """Return the weights ``(B, 1, *S)`` of the voxels that the fixed mask and all the warped ones leave, None for 1."""
-    masks = [] if fixed is None else [fixed]
-    masks += [] if moving is None else [warp(moving, u, grid) for u in maps]
-    return torch.stack(masks).prod(0) if masks else None
+    mask = fixed
+    if moving is not None:
+        for u in maps:
+            mask = weighted(warp(moving, u, grid), mask)
+    return mask
 
 
 def forward_similarity(problem: RegistrationProblem, settings: RegistrationSettings) -> SimilarityTerm:

@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.image import AUTO, Image, overlap
-from torchdeform.core.resampling import box_sum, with_nodes
+from torchdeform.core.resampling import with_nodes
 from torchdeform.core.stages import begin
 from torchdeform.core.transform import Affine
 from torchdeform.errors import InputError
-from torchdeform.metrics.correlation import LNCC_FLOOR, contrast, local_contrast
+from torchdeform.metrics.base import weighted
+from torchdeform.metrics.correlation import LNCC_FLOOR, contrast, local_contrast, window_mean, window_moments
 from torchdeform.metrics.similarity import mark
 from torchdeform.registration.affine.align import Alignment, align
 from torchdeform.registration.problem import Annotations, PlacedImage, RegistrationProblem, placed_images, resample_pair
@@ -99,8 +100,7 @@ def _marked(problem: RegistrationProblem, settings: RegistrationSettings) -> tup
     mask, chosen = problem.mask, settings.similarity
     found = mark(chosen.measure, problem.fixed, problem.moving, mask=mask, window=chosen.window, grid=problem.grid)
     contrast = local_contrast(problem.fixed, chosen.window)
-    counted = contrast if problem.fixed_mask is None else contrast * problem.fixed_mask
-    seen = contrast if mask is None else contrast * mask
+    counted, seen = (weighted(contrast, given) for given in (problem.fixed_mask, mask))
     return found, found * (seen.flatten(1).sum(1) / counted.flatten(1).sum(1))
 
 
@@ -146,11 +146,8 @@ def sign_agreement(problem: RegistrationProblem) -> float:
     """
     problem = problem.on(with_nodes(problem.grid, _NODES**problem.grid.dim))
     images = problem.fixed, problem.moving
-    count = box_sum(torch.ones_like(problem.fixed[:1, :1]), _WINDOW)
-    means = [box_sum(image, _WINDOW) / count for image in images]
-    spread = [(box_sum(x * x, _WINDOW) / count - m * m).clamp(min=0) for x, m in zip(images, means, strict=True)]
-    covariance = box_sum(images[0] * images[1], _WINDOW) / count - means[0] * means[1]
+    means, spread = zip(*(window_moments(image, _WINDOW) for image in images), strict=True)
+    covariance = window_mean(images[0] * images[1], _WINDOW) - means[0] * means[1]
     r = covariance / ((spread[0] + LNCC_FLOOR) * (spread[1] + LNCC_FLOOR)).sqrt()
-    weight = contrast(spread[0], _CLEAR) * contrast(spread[1], _CLEAR)
-    weight = weight if problem.mask is None else weight * problem.mask
+    weight = weighted(contrast(spread[0], _CLEAR) * contrast(spread[1], _CLEAR), problem.mask)
     return float((weight * r).sum().abs() / (weight * r.abs()).sum().clamp(min=torch.finfo(r.dtype).tiny))

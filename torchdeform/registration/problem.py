@@ -12,6 +12,7 @@ from torchdeform.core.intensities import corresponding_channels, fill, to_common
 from torchdeform.core.resampling import restrict
 from torchdeform.core.transform import Affine
 from torchdeform.errors import InputError
+from torchdeform.metrics.base import weighted
 from torchdeform.metrics.similarity import needs_common_scale
 from torchdeform.registration.settings import RegistrationSettings
 
@@ -120,8 +121,7 @@ class RegistrationProblem:
     @property
     def mask(self) -> Tensor | None:
         """The weights of both masks, None for 1 everywhere."""
-        given = [mask for mask in (self.fixed_mask, self.moving_mask) if mask is not None]
-        return torch.stack(torch.broadcast_tensors(*given)).prod(0) if given else None
+        return self.moving_mask if self.fixed_mask is None else weighted(self.fixed_mask, self.moving_mask)
 
     def on(self, coarse: Grid) -> "RegistrationProblem":
         """Return the problem on a coarser grid of the same box."""
