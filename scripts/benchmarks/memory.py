@@ -49,8 +49,8 @@ def run(case: Case) -> int:
     from torchdeform.cli.main import main as register
     from torchdeform.core.grid import Grid
     from torchdeform.core.image import Image
+    from torchdeform.core.memory import peak
     from torchdeform.io import write_image
-    from torchdeform.pipeline.memory import peak
 
     dim, n, channels, *settings = case
     torch.manual_seed(0)

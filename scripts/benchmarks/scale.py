@@ -79,7 +79,7 @@ def _held(device: str) -> int:
 
 def measure(shape: Shape, options: argparse.Namespace) -> dict[str, Any]:
     """Return what a fresh process finds for one size, or why it finds nothing."""
-    from torchdeform.pipeline.memory import available
+    from torchdeform.core.memory import available
 
     free = available(options.device)
     if free is not None and free < _NEEDED * math.prod(shape):

@@ -12,12 +12,12 @@ import pytest
 from nested_settings import changed
 
 from torchdeform.cohort.executors.local import Engine
-from torchdeform.cohort.executors.worker import EngineError, TimeLimit, WorkerLost
 from torchdeform.cohort.journal import Journal
 from torchdeform.cohort.plan import Failure, Job
 from torchdeform.cohort.run import Event, review, run
 from torchdeform.cohort.settings import EngineSettings
 from torchdeform.cohort.task import DONE, FAILED, PairReport, Task
+from torchdeform.core.worker import EngineError, TimeLimit, WorkerLost
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.pipeline.register import PairFiles
 from torchdeform.registration.settings import RegistrationSettings

@@ -26,6 +26,9 @@ HOMES = {
     "torchdeform": set(),
     "torchdiffeq": {"core.flow"},
     "SimpleITK": {"io"},
+    "pydicom": {"io"},
+    "nibabel": {"io"},
+    "tifffile": {"io"},
     "matplotlib": {"report"},
     "typer": {"cli"},
     "rich": {"cli"},
@@ -33,7 +36,10 @@ HOMES = {
     "yaml": {"pipeline.config"},
     "kornia": {"core.image"},
 }
-HEAVY = ["SimpleITK", "matplotlib", "typer", "pydantic", "kornia", "torchdiffeq", "scipy", "skimage", "yaml", "rich"]
+HEAVY = [
+    "SimpleITK", "matplotlib", "typer", "pydantic", "kornia", "torchdiffeq", "scipy", "skimage", "yaml", "rich", "pydicom",
+    "nibabel", "tifffile",
+]  # fmt: skip
 
 
 def imports(source: str) -> list[str]:

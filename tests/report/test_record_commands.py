@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from nested_settings import settings_of
 
+from torchdeform.core.memory import parse_size
 from torchdeform.pipeline.config import load_settings, parse_override, preset_names
-from torchdeform.pipeline.memory import parse_size
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.record import apply_commands, changed, repeat_command
 

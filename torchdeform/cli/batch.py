@@ -15,8 +15,8 @@ from torchdeform.cohort.run import review, run
 from torchdeform.cohort.schema import cohort_schema, read_cohort
 from torchdeform.cohort.settings import EngineSettings
 from torchdeform.cohort.summary import FAILURES, PAGE, Summary
+from torchdeform.core.memory import readable
 from torchdeform.io.files import atomic_folder
-from torchdeform.pipeline.memory import readable
 from torchdeform.report.record import write_json
 
 CohortFile = Annotated[Path, typer.Argument(metavar="COHORT.yaml", help="What to register, and how.")]

@@ -26,10 +26,10 @@ from torchdeform.cli.options import (
     warn,
 )
 from torchdeform.cli.progress import StepProgress
+from torchdeform.core.memory import parse_size
 from torchdeform.io.files import stem
 from torchdeform.metrics.similarity import measure_name
 from torchdeform.pipeline.config import load_settings, parse_override, preset_names
-from torchdeform.pipeline.memory import parse_size
 from torchdeform.pipeline.register import REPORT, REPORTS, Outcome, PairFiles, register_files
 from torchdeform.registration.affine.settings import ALIGNMENTS
 from torchdeform.registration.verdict import BAD, GOOD, LOOK, MARKS, WARNED

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Self
 
 from torchdeform.cohort.executors.local import Engine
-from torchdeform.cohort.executors.worker import EngineError
 from torchdeform.cohort.journal import Journal, Record
 from torchdeform.cohort.plan import Failure, Job
 from torchdeform.cohort.settings import EngineSettings
 from torchdeform.cohort.summary import Summary, log_of, summarise
 from torchdeform.cohort.task import DONE, FAILED, PairReport, Task
+from torchdeform.core.worker import EngineError
 from torchdeform.errors import ComputationError, InputError, explain
 
 EVENTS = "events.jsonl"

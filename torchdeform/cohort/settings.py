@@ -10,8 +10,8 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationInfo, model_validator
 
 from torchdeform.cohort.patterns import literal, part_names
+from torchdeform.core.memory import parse_size
 from torchdeform.errors import InputError
-from torchdeform.pipeline.memory import parse_size
 from torchdeform.registration.template import AveragingSettings, Pose
 
 

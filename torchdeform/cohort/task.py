@@ -13,8 +13,8 @@ from time import perf_counter, strftime
 from typing import Any
 
 from torchdeform.cohort.plan import Job, register_job
+from torchdeform.core.memory import peak
 from torchdeform.errors import InputError, explain
-from torchdeform.pipeline.memory import peak
 
 DONE, FAILED = "done", "failed"
 

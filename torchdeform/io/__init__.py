@@ -1,20 +1,9 @@
-"""Files in and out: images, labels, points, displacement fields and transforms, in ITK's conventions."""
+"""Files in and out: images, labels, points, displacement fields and transforms, in ITK's conventions.
 
-from torchdeform.io.images import read_image, read_labels, write_image, write_labels
-from torchdeform.io.points import Points, matched, read_points, write_points
-from torchdeform.io.transforms import read_displacement, read_transform, write_displacement, write_transform
+The names stand in ``__init__.pyi`` and are loaded when they are first used: a process that only calls a C library
+needs no torch.
+"""
 
-__all__ = [
-    "Points",
-    "matched",
-    "read_displacement",
-    "read_image",
-    "read_labels",
-    "read_points",
-    "read_transform",
-    "write_displacement",
-    "write_image",
-    "write_labels",
-    "write_points",
-    "write_transform",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

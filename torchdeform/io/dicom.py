@@ -14,7 +14,7 @@ from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import itk
 from torchdeform.io.files import read_head
-from torchdeform.io.validation import DAMAGED
+from torchdeform.io.gate import DAMAGED
 
 if TYPE_CHECKING:
     import SimpleITK as sitk

@@ -18,8 +18,9 @@ from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import dicom, itk
 from torchdeform.io.files import atomic_folder, suffix
+from torchdeform.io.gate import DAMAGED
 from torchdeform.io.tiff import read_tiff, write_tiff
-from torchdeform.io.validation import DAMAGED, NOT_SQUARE, other_kind, require_sound
+from torchdeform.io.validation import NOT_SQUARE, other_kind, require_sound
 
 
 @dataclass(frozen=True)

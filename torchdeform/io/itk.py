@@ -14,7 +14,8 @@ from torchdeform.core.grid import Grid, slabs
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io.files import atomic_folder, native_stderr
-from torchdeform.io.validation import DAMAGED, NOT_SQUARE
+from torchdeform.io.gate import DAMAGED
+from torchdeform.io.validation import NOT_SQUARE
 
 if TYPE_CHECKING:
     import SimpleITK as sitk

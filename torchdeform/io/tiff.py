@@ -18,7 +18,7 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import itk
-from torchdeform.io.validation import DAMAGED
+from torchdeform.io.gate import DAMAGED
 
 if TYPE_CHECKING:
     from tifffile import TiffFile

@@ -12,11 +12,10 @@ from typing import BinaryIO
 
 import numpy as np
 
-from torchdeform.errors import InputError, nearest_name
+from torchdeform.errors import InputError
 from torchdeform.io.files import read_head, suffix
+from torchdeform.io.gate import DAMAGED, require_beside, require_file
 
-DAMAGED = "is damaged or incomplete; fetch or export it again"
-EMPTY = "is empty; fetch or export it again"
 NOT_SQUARE = "has axes that are not at right angles; reslice it onto a rectangular grid first"
 NOT_FINITE = "has pixels that are NaN or infinite; replace them first, for instance by 0"
 
@@ -67,19 +66,8 @@ _NIFTI = {
 
 def require_sound(path: Path) -> None:
     """Raise `InputError` unless ``path`` is a file that can be opened and has no visible fault."""
-    if not path.exists():
-        near = nearest_name(path.name, (p.name for p in path.parent.iterdir())) if path.parent.is_dir() else ""
-        raise InputError(f"{path} does not exist; check the name{near}")
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; give an image file")
-    if not path.is_file():
-        raise InputError(f"{path} is no file but a device or a pipe; give an image file")
-    try:
-        fault = _CHECKS.get(suffix(path), lambda _: None)(path) if path.stat().st_size else EMPTY
-        path.open("rb").close()
-    except OSError as error:
-        raise InputError(f"{path} cannot be opened: {error.strerror}; check its permissions") from error
-    if fault:
+    require_file(path, "image file")
+    if fault := _CHECKS.get(suffix(path), lambda _: None)(path):
         raise InputError(f"{path} {fault}")
 
 
@@ -240,9 +228,12 @@ def _parse(text: str) -> list[float] | None:
 
 def _check_data(path: Path, name: str) -> str | None:
     """A separate file of pixels must exist. Lists and patterns of files are left to ITK."""
-    if name.upper() == "LOCAL" or name.startswith("LIST") or "%" in name or (path.parent / name).exists():
+    if name.upper() == "LOCAL" or name.startswith("LIST") or "%" in name:
         return None
-    return f"keeps its pixels in {name}, which does not exist; put it beside the header"
+    if not (path.parent / name).exists():
+        return f"keeps its pixels in {name}, which does not exist; put it beside the header"
+    require_beside(path.parent / name, path)
+    return None
 
 
 def _check_length(path: Path, head: bytes, fields: dict[str, str]) -> str | None:

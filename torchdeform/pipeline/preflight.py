@@ -14,12 +14,13 @@ from torch import Tensor
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, background, centre_of_mass, overlap, require_same_place, resample
 from torchdeform.core.intensities import corresponding_channels, intensity_range
+from torchdeform.core.memory import available, readable
 from torchdeform.core.resampling import MIN_NODES
 from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
 from torchdeform.io.files import stem
 from torchdeform.metrics.similarity import needs_common_scale
-from torchdeform.pipeline.memory import available, footprint, readable
+from torchdeform.pipeline.memory import footprint
 from torchdeform.registration.settings import RegistrationSettings
 
 ERROR, WARNING, NOTE = "error", "warning", "note"

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.image import Image, resample
+from torchdeform.core.memory import available, peak, readable
 from torchdeform.core.resampling import restrict
 from torchdeform.core.stages import begin
 from torchdeform.core.transform import Transform
@@ -19,7 +20,7 @@ from torchdeform.io.files import atomic_folder, require_writable
 from torchdeform.io.images import ending_like, read_labels, read_optional, require_storable, write_labels
 from torchdeform.io.points import matched, read_points
 from torchdeform.metrics.evaluation import common_labels
-from torchdeform.pipeline.memory import available, fitting_grid, footprint, peak, readable
+from torchdeform.pipeline.memory import fitting_grid, footprint
 from torchdeform.pipeline.preflight import WARNING, preflight
 from torchdeform.registration.deformable import resample_result
 from torchdeform.registration.problem import Annotations

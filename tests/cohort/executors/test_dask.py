@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from cohort_files import results
 
-from torchdeform.cohort.executors.worker import EngineError
 from torchdeform.cohort.run import Event, run
 from torchdeform.cohort.settings import ClusterSettings, EngineSettings
+from torchdeform.core.worker import EngineError
 
 # Away from every network dask has no address to look up, and takes the name of the machine.
 pytestmark = pytest.mark.filterwarnings("ignore:Couldn't detect a suitable IP address")

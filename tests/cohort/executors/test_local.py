@@ -16,11 +16,11 @@ from cohort_files import results
 
 from torchdeform.cohort.executors import local
 from torchdeform.cohort.executors.local import LocalExecutor, environment, open_local, usable_cores, visible_gpus
-from torchdeform.cohort.executors.worker import TimeLimit, Worker, WorkerLost
 from torchdeform.cohort.run import run
 from torchdeform.cohort.settings import EngineSettings
 from torchdeform.cohort.summary import log_of
 from torchdeform.cohort.task import Task
+from torchdeform.core.worker import TimeLimit, Worker, WorkerLost
 from torchdeform.errors import ComputationError
 
 
@@ -110,7 +110,7 @@ def test_shutdown_now_ends_what_runs_and_cancels_what_waits():
 def test_workers_end_when_their_parent_is_killed():
     code = (
         "import os, time; from torchdeform.cohort.executors.local import LocalExecutor\n"
-        "from torchdeform.cohort.executors.worker import Worker\n"
+        "from torchdeform.core.worker import Worker\n"
         "pool = LocalExecutor([Worker()])\n"
         "print(pool.submit(os.getpid).result(), flush=True)\n"
         "pool.submit(time.sleep, 600.0).result()\n"

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 from torchdeform.cohort.estimate import measure
 from torchdeform.cohort.executors.local import Engine, environment, usable_cores, visible_gpus
-from torchdeform.cohort.executors.worker import EngineError, Worker
 from torchdeform.cohort.plan import Job
 from torchdeform.cohort.settings import ClusterSettings, EngineSettings
 from torchdeform.cohort.task import PairReport, Task, perform
+from torchdeform.core.memory import readable
+from torchdeform.core.worker import EngineError, Worker
 from torchdeform.errors import InputError
-from torchdeform.pipeline.memory import readable
 
 if TYPE_CHECKING:
     from distributed import Client

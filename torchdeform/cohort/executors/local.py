@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from torchdeform.cohort.estimate import measure
-from torchdeform.cohort.executors.worker import Worker
 from torchdeform.cohort.plan import Job
 from torchdeform.cohort.settings import EngineSettings
 from torchdeform.cohort.task import PairReport, Task, perform
-from torchdeform.pipeline.memory import available
+from torchdeform.core.memory import available
+from torchdeform.core.worker import Worker
 
 
 @dataclass(frozen=True)

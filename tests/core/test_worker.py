@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from torchdeform.cohort.executors.worker import EngineError, Worker
+from torchdeform.core.worker import EngineError, Worker
 
 
 def test_a_hundred_calls_on_one_worker():
@@ -17,7 +17,7 @@ def test_a_hundred_calls_on_one_worker():
 
 
 def test_processes_that_do_not_start_stop_everything(monkeypatch):
-    monkeypatch.setattr("torchdeform.cohort.executors.worker.sys.executable", "/bin/false")
-    monkeypatch.setattr("torchdeform.cohort.executors.worker.sleep", lambda seconds: None)
+    monkeypatch.setattr("torchdeform.core.worker.sys.executable", "/bin/false")
+    monkeypatch.setattr("torchdeform.core.worker.sleep", lambda seconds: None)
     with pytest.raises(EngineError, match="do not start"):
         Worker().call(math.sqrt, 4.0)

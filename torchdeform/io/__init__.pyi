@@ -1,0 +1,12 @@
+from .images import read_image as read_image
+from .images import read_labels as read_labels
+from .images import write_image as write_image
+from .images import write_labels as write_labels
+from .points import Points as Points
+from .points import matched as matched
+from .points import read_points as read_points
+from .points import write_points as write_points
+from .transforms import read_displacement as read_displacement
+from .transforms import read_transform as read_transform
+from .transforms import write_displacement as write_displacement
+from .transforms import write_transform as write_transform
