@@ -37,8 +37,8 @@ HOMES = {
     "kornia": {"core.image"},
 }
 HEAVY = [
-    "SimpleITK", "matplotlib", "typer", "pydantic", "kornia", "torchdiffeq", "scipy", "skimage", "yaml", "rich", "pydicom",
-    "nibabel", "tifffile",
+    "SimpleITK", "matplotlib", "typer", "pydantic", "kornia", "torchdiffeq", "scipy", "skimage", "yaml", "rich",
+    "pydicom", "nibabel", "tifffile",
 ]  # fmt: skip
 
 
