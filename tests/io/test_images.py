@@ -161,7 +161,7 @@ def test_damaged_files_are_refused_quietly(tmp_path, capfd, ending, share):
     [
         ("no.png", lambda p: None, "does not exist"),
         ("folder.png", lambda p: p.mkdir(), "is a folder"),
-        ("text.png", lambda p: p.write_text("hello"), "cannot be read as an image"),
+        ("text.png", lambda p: p.write_text("hello"), "no image of a known format"),
         ("text.txt", lambda p: p.write_text("hello"), "no image of a known format"),
         ("series.nii.gz", lambda p: sitk.WriteImage(_itk(np.zeros((3, 4, 5, 6))), str(p)), "is a series"),
         ("line.mha", lambda p: sitk.WriteImage(_itk(np.zeros((1, 1, 6))), str(p)), "at least two axes"),

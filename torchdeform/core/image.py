@@ -38,6 +38,7 @@ class Image:
         pixel_type: numpy name of the type it is stored with, for writing results alike.
         unit: what its lengths are shown in: ``px`` for files without a spacing, whose pixels are 1 apart, ``mm``, or
             ``µm`` where the file has it. Coordinates are in mm with both of the latter.
+        remarks: sentences about what its reader had to decide, which people should know.
 
     Raises:
         InputError: the parts do not fit together, or an unknown unit.
@@ -50,6 +51,7 @@ class Image:
     name: str = "image"
     pixel_type: str = "float32"
     unit: str = "mm"
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         dim = self.grid.dim

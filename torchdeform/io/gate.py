@@ -116,13 +116,19 @@ def _decode(content: bytes, coding: str, legacy: bool) -> str:
         return content.decode("cp1252")
 
 
-def require_room(path: Path, needed: int) -> None:
+def require_room(path: Path, needed: int, *, stored: int | None = None) -> None:
     """Raise `InputError` unless the ``needed`` bytes that the header of ``path`` announces can be there and fit.
+
+    Args:
+        path: the file of the header.
+        needed: bytes of all pixels.
+        stored: bytes of the files that hold them; by default of ``path``.
 
     Notes:
         Nothing that deflate packed becomes more than 1032 times as long, and other packings of pixels stay below.
     """
-    if needed > max(_SMALL, _DENSEST * path.stat().st_size):
+    stored = path.stat().st_size if stored is None else stored
+    if needed > max(_SMALL, _DENSEST * stored):
         raise InputError(f"{path} announces {readable(needed)} of pixels, far more than it can hold; it {DAMAGED}")
     free = available()
     if free is not None and needed > free:
