@@ -81,7 +81,7 @@ class _Header:
     def numbers(self) -> tuple[int, np.dtype[Any]]:
         """Numbers of a pixel that the type has, and their type."""
         count, kind = _TYPES[int(self.fields["datatype"])]
-        return count, np.dtype(kind).newbyteorder(self.fields["dim"].dtype.byteorder)
+        return count, np.dtype(self.fields["dim"].dtype.str[0] + kind)
 
     @property
     def start(self) -> int:
@@ -141,8 +141,8 @@ def read_nifti(path: Path) -> Volume:
 def _read_header(path: Path) -> _Header:
     with opened(path) as file:
         head = file.read(540)
-    for order in "<>":
-        length = int(np.frombuffer(head[:4].ljust(4), order + "i4")[0])
+    for order in ("<", ">"):
+        length = int(np.frombuffer(head[:4].ljust(4), f"{order}i4")[0])
         if length in _FIELDS and len(head) >= length:
             names, formats, offsets = zip(*_FIELDS[length], strict=True)
             layout: Any = {"names": names, "formats": formats, "offsets": offsets, "itemsize": length}
@@ -252,21 +252,21 @@ def _qform(header: _Header) -> NDArray[np.float64]:
     if not square <= _NO_ROTATION:  # NaN too
         raise InputError(f"{header.path} has a qform that is no rotation; correct its header")
     a, (b, c, d) = math.sqrt(max(0.0, 1 - square)), imaginary / max(1.0, math.sqrt(square))
-    rotation = np.array(
+    rotation: NDArray[np.float64] = np.array(
         [
             [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
             [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
             [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - b * b - c * c],
         ]
     )
-    handed = np.array([1, 1, -1 if fields["pixdim"][0] < 0 else 1])
+    handed = np.array([1.0, 1.0, -1.0 if fields["pixdim"][0] < 0 else 1.0])
     lengths = np.abs(fields["pixdim"][1:4].astype(np.float64))
-    return np.column_stack([rotation * handed * lengths, fields["qoffset"].astype(np.float64)])
+    return np.column_stack([rotation * handed * lengths, fields["qoffset"]])
 
 
 def _without_place(header: _Header) -> NDArray[np.float64]:
     lengths = np.abs(header.fields["pixdim"][1:4].astype(np.float64))
-    return np.column_stack([_LPS * np.diag(lengths), np.zeros(3)])
+    return np.column_stack([_LPS * np.diag(lengths), np.zeros(3, np.float64)])
 
 
 def place(values: NDArray[np.generic], rows: NDArray[np.float64], path: Path) -> Volume:

@@ -5,13 +5,8 @@ from pathlib import Path
 
 from torchdeform.errors import InputError
 from torchdeform.io.files import read_head
-from torchdeform.io.gate import DAMAGED, require_file
+from torchdeform.io.gate import DAMAGED
 from torchdeform.io.kinds import BMP, JPEG
-
-
-def require_sound(path: Path) -> None:
-    """Raise `InputError` unless ``path`` is a file that can be opened and has no visible fault."""
-    require_file(path, "image file")
 
 
 def require_sound_picture(path: Path, kind: str) -> None:

@@ -63,7 +63,7 @@ def squared(direction: NDArray[np.float64], name: str) -> NDArray[np.float64]:
     if error < _EXACT:
         return direction
     left, _, right = np.linalg.svd(direction)
-    return left @ right
+    return np.asarray(left @ right, np.float64)
 
 
 def require_one(path: Path, size: Sequence[int]) -> None:
