@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from nested_settings import changed
 
-from torchdeform.cohort.journal import JOURNAL, Journal, Record
+from torchdeform.cohort.journal import JOURNAL, Journal, Record, open_lines
 from torchdeform.cohort.plan import Job
 from torchdeform.cohort.task import DONE, FAILED, PairReport
 from torchdeform.errors import InputError, MachineError
@@ -132,6 +132,12 @@ def test_a_line_that_cannot_be_written_whole_is_not_written(tmp_path, monkeypatc
         assert journal.records.keys() == {"a"}
         journal.record(Record("c", "3", REPORT))
     assert records(tmp_path).keys() == {"a", "c"}
+
+
+def test_nothing_is_appended_to_what_could_block(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="pipe is no file"):
+        open_lines(tmp_path / "pipe")
 
 
 @pytest.mark.parametrize("how", ["removed", "replaced", "moved"])

@@ -4,13 +4,13 @@ import hashlib
 import json
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from time import time_ns
 from types import TracebackType
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -79,14 +79,12 @@ class Journal:
         self._path = folder / JOURNAL
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
+            self._file = open_lines(self._path)
         except OSError as error:
             if of_machine(error):
                 raise disk_failure(error, folder) from error
             raise InputError(f"cannot write to {folder}: {error.strerror}; choose another folder") from error
         try:
-            if not stat.S_ISREG(os.fstat(self._file).st_mode):
-                raise InputError(f"{self._path} is no file; remove it, or choose another folder")
             self._lock(folder)
             self._read()
         except BaseException:
@@ -110,7 +108,7 @@ class Journal:
             OSError: it cannot be written; it is as before then.
         """
         self.require_there()
-        self._append({"pair": record.name, "key": record.key, **asdict(record.report)})
+        append(self._file, {"pair": record.name, "key": record.key, **asdict(record.report)})
         os.fsync(self._file)
         self.records[record.name] = record
 
@@ -168,17 +166,6 @@ class Journal:
                 self._digests[same] = digest
         return self._digests[same]
 
-    def _append(self, record: dict[str, Any]) -> None:
-        """Append a line, or nothing."""
-        line, before = memoryview(json.dumps(record).encode() + b"\n"), os.fstat(self._file).st_size
-        try:
-            while line:  # a disk that is nearly full writes a part
-                line = line[os.write(self._file, line) :]
-        except BaseException:
-            with suppress(OSError):
-                os.ftruncate(self._file, before)
-            raise
-
     def _lock(self, folder: Path) -> None:
         """Lock out other runs until this process ends, however it ends."""
         try:
@@ -214,6 +201,27 @@ class Journal:
             return False
         self.records[found.pair] = Record(found.pair, found.key, report)
         return True
+
+
+def open_lines(path: Path) -> int:
+    """Return the descriptor of a file for `append`; made if missing, `InputError` if it is a pipe or a device."""
+    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
+    if not stat.S_ISREG(os.fstat(file).st_mode):
+        os.close(file)
+        raise InputError(f"{path} is no file; remove it, or choose another folder")
+    return file
+
+
+def append(file: int, record: Mapping[str, object]) -> None:
+    """Append a record as a line of JSON to an open file, whole or not at all."""
+    line, before = memoryview(json.dumps(record).encode() + b"\n"), os.fstat(file).st_size
+    try:
+        while line:  # a disk that is nearly full writes a part
+            line = line[os.write(file, line) :]
+    except BaseException:
+        with suppress(OSError):
+            os.ftruncate(file, before)
+        raise
 
 
 def _files_of(path: Path) -> Iterator[Path]:

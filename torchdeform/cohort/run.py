@@ -1,6 +1,6 @@
 """The run of a cohort: every pair once, finished pairs skipped, every outcome written to disk at once."""
 
-import json
+import os
 import sys
 import time
 from collections import Counter
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Self
 
 from torchdeform.cohort.executors.local import Engine
-from torchdeform.cohort.journal import JOURNAL, Journal, Record
+from torchdeform.cohort.journal import JOURNAL, Journal, Record, append, open_lines
 from torchdeform.cohort.plan import SUBMISSION, Failure, Job
 from torchdeform.cohort.settings import EngineSettings
 from torchdeform.cohort.summary import Summary, log_of, summarise
@@ -102,6 +102,7 @@ def run(
         state = _State(out, journal, log)
         _say_skipped(journal, out)
         try:
+            log.write(BEGIN)
             try:
                 todo = [job for job in jobs if not (resume and state.is_finished(job, retry_failed))]
                 _remove_leftovers(todo, out)
@@ -150,14 +151,13 @@ class _EventLog:
         self._total, self._report = total, report
         self._counts = Counter({FAILED: failed, SKIPPED: failed})
         self._start = time.monotonic()
-        self._file = (out / EVENTS).open("a", encoding="utf-8")
+        self._file = open_lines(out / EVENTS)
 
     def __enter__(self) -> Self:
-        self.write(BEGIN)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        os.close(self._file)
 
     def write(self, kind: str, name: str = "", about: PairReport | None = None) -> None:
         """Write an event, with the report of the pair if it is about a pair."""
@@ -175,8 +175,7 @@ class _EventLog:
             self._counts[SKIPPED],
             time.monotonic() - self._start,
         )
-        self._file.write(json.dumps({"time": time.time(), **asdict(event)}) + "\n")
-        self._file.flush()
+        append(self._file, {"time": time.time(), **asdict(event)})
         if self._report is not None:
             self._report(event)
 

@@ -67,6 +67,8 @@ def atomic_folder(folder: Path, replaced: Callable[[], Iterable[str]] = tuple) -
             _exchange(new, old, folder, replaced)
         except Exception as error:
             failure = None if isinstance(error, MachineError) else of_machine(error) or _probe(place)
+            if isinstance(failure, OSError) and _places_above(folder):
+                raise failure from error  # the outer one says where
             if isinstance(failure, OSError):
                 raise disk_failure(failure, folder, size_of_files(new.rglob("*"))) from error
             if failure is not None:
@@ -82,14 +84,19 @@ def disk_failure(error: OSError, folder: Path, begun: int = 0) -> MachineError:
         folder: that was to be written.
         begun: bytes that were written there and are removed again.
     """
-    above = _places_above(folder)
-    shown, advice = (above[-1].parent if above else folder), "mend that"
+    advice = "mend that"
     if error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None)):
         free = begun
         with suppress(OSError):
-            free += shutil.disk_usage(_nearest_folder(shown)).free
+            free += shutil.disk_usage(_nearest_folder(folder)).free
         advice = f"{readable(free)} are free, which is not enough; make room"
-    return MachineError(f"cannot write to {shown}: {error.strerror}; {advice} and run the same command again")
+    return MachineError(f"cannot write to {folder}: {error.strerror}; {advice} and run the same command again")
+
+
+def require_space(folder: Path, size: int) -> None:
+    """Raise the system's error of a full disk unless it has room for so many bytes; some libraries bear it badly."""
+    if shutil.disk_usage(folder).free < size:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
 
 
 def _places_above(folder: Path) -> list[Path]:
