@@ -93,11 +93,12 @@ def save(image: "sitk.Image", path: Path) -> None:
     """
     import SimpleITK as sitk
 
-    try:
-        with atomic_folder(path.parent) as folder, native_stderr(), _no_warnings():
+    with atomic_folder(path.parent) as folder, native_stderr(), _no_warnings():
+        try:
             sitk.WriteImage(image, str(folder / path.name), useCompression=True)
-    except RuntimeError as error:
-        raise InputError(f"{path.name} cannot be written: {reason(error)}; choose another format or folder") from error
+        except RuntimeError as error:
+            said = f"{path.name} cannot be written: {reason(error)}; choose another format or folder"
+            raise InputError(said) from error
 
 
 def reason(error: RuntimeError) -> str:
