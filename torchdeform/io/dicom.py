@@ -17,6 +17,7 @@ from torchdeform.io import itk
 from torchdeform.io.dicom_header import DCM2NIIX, Slice, is_dicom, no_image, slices
 from torchdeform.io.dicom_pixels import pixels
 from torchdeform.io.gate import DAMAGED
+from torchdeform.io.validation import NOT_FINITE
 
 # A file is read as its whole series when that has so many slices. With fewer it cannot be registered as a volume.
 VOLUME_SLICES = 8
@@ -199,14 +200,18 @@ def _values(slices: Sequence[Slice], name: str) -> NDArray[np.generic]:
     parts = [one for path, group in groupby(slices, lambda s: s.path) for one in _scaled(pixels(path), list(group))]
     if len({part.shape for part in parts}) > 1:
         raise InputError(f"{name} {DAMAGED}")
-    return np.stack(parts)
+    values = np.stack(parts)
+    if values.dtype.kind == "f" and not np.isfinite(values).all():
+        raise InputError(f"{name} {NOT_FINITE}")
+    return values
 
 
 def _scaled(stored: NDArray[np.generic], slices: Sequence[Slice]) -> list[NDArray[np.generic]]:
     """Return the frames of a file that are wanted, in the stored type where no scale is set."""
     if all(s.scale == (1.0, 0.0) for s in slices):
         return [stored[s.frame] for s in slices]
-    return [(stored[s.frame] * s.scale[0] + s.scale[1]).astype(np.float32) for s in slices]
+    with np.errstate(over="ignore"):  # what is too large becomes infinite, which is refused
+        return [(stored[s.frame] * s.scale[0] + s.scale[1]).astype(np.float32) for s in slices]
 
 
 def _require_regular(slices: Sequence[Slice], name: str) -> float:

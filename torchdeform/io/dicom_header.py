@@ -85,42 +85,15 @@ _WHERE_DOUBLE = {
     ),
 }
 _KEYWORDS = [
-    "SOPClassUID",
-    "ImageType",
-    "Modality",
-    "SeriesInstanceUID",
-    "SeriesDescription",
-    "ConcatenationUID",
-    "NumberOfFrames",
-    "Rows",
-    "Columns",
-    "SamplesPerPixel",
-    "BitsAllocated",
-    "SliceThickness",
-    "SpacingBetweenSlices",
-    "RescaleSlope",
-    "RescaleIntercept",
-    "DoseGridScaling",
-    "GridFrameOffsetVector",
-    "ImagePositionPatient",
-    "ImageOrientationPatient",
-    "FrameTime",
-    "FrameTimeVector",
-    "DetectorInformationSequence",
-    "SequenceOfUltrasoundRegions",
-    "SharedFunctionalGroupsSequence",
-    "DiffusionBValue",
-    "DiffusionGradientOrientation",
-    "TriggerTime",
-    "AcquisitionTime",
-    "EchoNumbers",
-    "EchoTime",
-    "InversionTime",
-    "TemporalPositionIdentifier",
-    "PixelSpacing",
-    "ImagerPixelSpacing",
+    "SOPClassUID", "ImageType", "Modality", "SeriesInstanceUID", "SeriesDescription", "ConcatenationUID",
+    "NumberOfFrames", "Rows", "Columns", "SamplesPerPixel", "BitsAllocated", "SliceThickness",
+    "SpacingBetweenSlices", "RescaleSlope", "RescaleIntercept", "DoseGridScaling", "GridFrameOffsetVector",
+    "ImagePositionPatient", "ImageOrientationPatient", "FrameTime", "FrameTimeVector",
+    "DetectorInformationSequence", "SequenceOfUltrasoundRegions", "SharedFunctionalGroupsSequence",
+    "DiffusionBValue", "DiffusionGradientOrientation", "TriggerTime", "AcquisitionTime", "EchoNumbers", "EchoTime",
+    "InversionTime", "TemporalPositionIdentifier", "PixelSpacing", "ImagerPixelSpacing",
     "NominalScannedPixelSpacing",
-]
+]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,9 +170,11 @@ def guarded(path: Path, work: Callable[[], _Result]) -> _Result:
         warnings.simplefilter("ignore")  # about values that break the standard but can be read
         try:
             return work()
-        except (InputError, OSError):
+        except InputError:
             raise
         except Exception as error:  # pydicom raises errors of a dozen types
+            if isinstance(error, OSError) and error.errno is not None:  # the machine's, not pydicom's
+                raise
             raise InputError(f"{path} {DAMAGED}") from error
 
 

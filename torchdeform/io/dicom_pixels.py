@@ -19,18 +19,9 @@ if TYPE_CHECKING:
 
 # What describes pixels and nothing else.
 _MODULE = [
-    "SamplesPerPixel",
-    "PhotometricInterpretation",
-    "PlanarConfiguration",
-    "NumberOfFrames",
-    "Rows",
-    "Columns",
-    "BitsAllocated",
-    "BitsStored",
-    "HighBit",
-    "PixelRepresentation",
-    "PixelData",
-]
+    "SamplesPerPixel", "PhotometricInterpretation", "PlanarConfiguration", "NumberOfFrames", "Rows", "Columns",
+    "BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation", "PixelData",
+]  # fmt: skip
 _SAMPLES = ("PixelData", "FloatPixelData", "DoubleFloatPixelData")
 _SUBSAMPLED = {"YBR_FULL_422": 2 / 3}  # stored numbers for each number of a pixel
 
@@ -74,7 +65,8 @@ def _native(path: Path, header: "Dataset") -> NDArray[np.generic]:
     share = _SUBSAMPLED.get(header.get("PhotometricInterpretation", ""), 1.0)
     if len(stored) < _numbers(header) * int(header.BitsAllocated) * share // 8:
         raise InputError(f"{path} {DAMAGED}")
-    return pixel_array(header)
+    found = pixel_array(header)
+    return found.astype(found.dtype.newbyteorder("="), copy=False)  # ITK would take it for this machine's order
 
 
 def _numbers(header: "Dataset") -> int:
