@@ -237,28 +237,29 @@ def image_size(path: Path) -> tuple[tuple[int, ...], int] | None:
     """Return the shape (z, y, x; without axes of one sample) and the channels of an image file, None if unknown.
 
     Args:
-        path: a file, or a folder of DICOM slices, which are all counted as one series.
+        path: a file, or a folder with a DICOM series.
 
     Notes:
         Reads no pixels, so the file may still be damaged. Formats that ITK does not know are unknown here.
     """
+    try:
+        found = dicom.size(path) if path.is_dir() or dicom.is_dicom(path) else _size_by_itk(path)
+    except InputError:
+        return None
+    if found is None:
+        return None
+    shape = tuple(n for n in found[0] if n > 1)
+    return (shape, found[1]) if len(shape) in (2, 3) else None
+
+
+def _size_by_itk(path: Path) -> tuple[tuple[int, ...], int] | None:
     import SimpleITK as sitk
 
-    files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
     reader = sitk.ImageFileReader()
-
-    def read_header() -> tuple[tuple[int, ...], int]:
-        reader.SetFileName(str(files[0]))
-        reader.ReadImageInformation()
-        return reader.GetSize(), reader.GetNumberOfComponents()
-
-    found = itk.quietly(read_header) if files else None
-    if found is None or isinstance(found, RuntimeError):
+    reader.SetFileName(str(path))
+    if isinstance(itk.quietly(reader.ReadImageInformation), RuntimeError):
         return None
-    size, channels = found
-    slices = (len(files),) if len(files) > 1 else ()
-    shape = tuple(n for n in (*slices, *size[::-1]) if n > 1)
-    return (shape, channels) if len(shape) in (2, 3) else None
+    return reader.GetSize()[::-1], reader.GetNumberOfComponents()
 
 
 def read_labels(path: str | os.PathLike[str]) -> Image:
