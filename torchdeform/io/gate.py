@@ -14,7 +14,7 @@ from torchdeform.errors import InputError, nearest_name
 
 DAMAGED = "is damaged or incomplete; fetch or export it again"
 EMPTY = "is empty; fetch or export it again"
-_CROP = "crop it, or use a machine with more"
+CROP = "crop it, or use a machine with more"
 
 LONGEST_TEXT = 16_000_000  # bytes of a text: settings, tables, landmarks, transforms
 _SMALL, _DENSEST = 64_000_000, 1100  # bytes that any file may announce; and per byte of a larger one
@@ -122,7 +122,7 @@ def _decode(content: bytes, coding: str, legacy: bool) -> str:
         return content.decode("cp1252")
 
 
-def require_room(path: Path, needed: int, *, held: int | None = None, remedy: str = _CROP) -> None:
+def require_room(path: Path, needed: int, *, held: int | None = None, remedy: str = CROP) -> None:
     """Raise `InputError` unless the ``needed`` bytes that the header of ``path`` announces can be there and fit.
 
     Args:
@@ -173,5 +173,5 @@ def reading(path: Path, fault: str = DAMAGED) -> Iterator[None]:
         if isinstance(error, OSError) and error.errno in _MACHINE:
             raise
         if isinstance(error, MemoryError):
-            raise InputError(f"{path} takes more memory than there is here; {_CROP}") from error
+            raise InputError(f"{path} takes more memory than there is here; {CROP}") from error
         raise InputError(f"{path} {fault}") from error

@@ -16,7 +16,7 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import itk
-from torchdeform.io.files import read_head
+from torchdeform.io.files import native_stderr, read_head
 from torchdeform.io.gate import reading, require_room
 
 UNREADABLE = "cannot be read as an image; it may be damaged: export it again"
@@ -63,7 +63,8 @@ def read_picture(path: Path) -> Image:
         form, orientation = picture.format or "", _orientation(picture)
         image = _by_itk(path, _BY_ITK[form]) if form in _BY_ITK else None
         if image is None or image.grid.shape != picture.size[::-1]:
-            image = _image(_pixels(picture, path), str(path))
+            with native_stderr():
+                image = _image(_pixels(picture, path), str(path))
     shown = form == "PNG" and set(image.grid.spacing) != {1.0}
     spacing = image.grid.spacing if shown else (1.0, 1.0)
     data = torch.from_numpy(upright(image.data.numpy(), orientation))
@@ -76,12 +77,16 @@ def picture_size(path: Path) -> tuple[tuple[int, int], int]:
 
     Raises:
         InputError: as `read_picture`, as far as the header tells.
+
+    Notes:
+        PNG may say only behind its pixels how it is turned, so that is left out.
     """
     with reading(path, UNREADABLE), _opened(path) as picture:
         _require_one(path, picture)
         width, height = picture.size
-        turned = picture.format == "JPEG" and _orientation(picture) > 4
-        return (width, height) if turned else (height, width), len(Picture.new(_mode(picture), (1, 1)).getbands())
+        turned = picture.format != "PNG" and _orientation(picture) > 4
+        shape, channels = (width, height) if turned else (height, width), Picture.getmodebands(_mode(picture))
+        return shape, 4 if channels == 2 else channels
 
 
 def upright(values: NDArray[np.generic], orientation: int) -> NDArray[np.generic]:

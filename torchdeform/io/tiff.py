@@ -13,10 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image
+from torchdeform.core.image import UNITS, Image
+from torchdeform.core.memory import available
 from torchdeform.errors import InputError
 from torchdeform.io.files import read_head
-from torchdeform.io.gate import DAMAGED, reading, require_beside, require_room
+from torchdeform.io.gate import CROP, DAMAGED, reading, require_beside, require_room
 from torchdeform.io.tiff_pixels import orientation_of, require_colours, shown, unpacked
 from torchdeform.io.tiff_scale import Scale, scale
 
@@ -66,8 +67,8 @@ def read_tiff(path: Path) -> Image:
     with _opened(path) as (file, series):
         axes, shape = _require_one(series, path)
         page = series[0].keyframe
-        _require_room(series, path)
         found = scale(file, page)
+        _require_room(series, path, found)
         values = unpacked(series, path).reshape(shape)
         if np.iscomplexobj(values):
             raise InputError(f"{path} holds complex numbers; save their magnitude and give that")
@@ -89,7 +90,8 @@ def tiff_size(path: Path) -> tuple[tuple[int, ...], int]:
         channels = math.prod(n for axis, n in lengths.items() if axis in _CHANNELS)
         spatial = [math.prod(n for axis, n in lengths.items() if axis not in "YX" + _CHANNELS)]
         spatial += [lengths.get(axis, 1) for axis in ("YX" if orientation_of(series[0].keyframe) <= 4 else "XY")]
-        return tuple(n for n in spatial if n > 1), 3 if series[0].keyframe.colormap is not None else channels
+        one = np.zeros((channels, 1, 1, 1), series[0].dtype)
+        return tuple(n for n in spatial if n > 1), len(shown(one, series[0].keyframe))
 
 
 def tiff_parts(path: Path) -> list[Path]:
@@ -124,8 +126,10 @@ def _opened(path: Path) -> "Iterator[tuple[TiffFile, Series]]":
     import tifffile
 
     tiff_parts(path)
-    with reading(path), _log_messages() as messages, tifffile.TiffFile(path) as file:
-        yield file, _shown_series(file)
+    with reading(path), _log_messages() as messages:
+        # tifffile would follow Micro-Manager's index into other files, that nobody named and nothing checks.
+        with tifffile.TiffFile(path, is_ndtiff=False, is_mmstack=False) as file:
+            yield file, _shown_series(file)
         if any(sign in line for line in messages for sign in _DAMAGE_SIGNS):
             raise InputError(f"{path} {DAMAGED}")
 
@@ -170,23 +174,30 @@ def _require_one(series: "Series", path: Path) -> tuple[str, tuple[int, ...]]:
     return first.axes, first.shape
 
 
-def _require_room(series: "Series", path: Path) -> None:
+def _require_room(series: "Series", path: Path, found: Scale) -> None:
     """Raise `InputError` unless the pixels can be in the file and fit into memory, and the largest piece too."""
     page, count = series[0].keyframe, sum(one.size for one in series)
-    size = page.dtype.itemsize
+    size = np.dtype(page.dtype).itemsize
     require_room(path, math.prod(page.chunks) * size)
     packed = count * page.bitspersample // 8
-    require_room(path, packed, held=count * (size + _KEPT), remedy=_smaller(series[0], path, size + _KEPT))
+    require_room(path, packed, held=count * (size + _KEPT), remedy=_smaller(series[0], path, size + _KEPT, found))
 
 
-def _smaller(series: "TiffPageSeries", path: Path, size: int) -> str:
+def _smaller(series: "TiffPageSeries", path: Path, size: int, found: Scale) -> str:
     """Return what to do with a slide that is too large, or with any other image."""
-    levels = [f"{level.sizes['width']}×{level.sizes['height']} (level {k})" for k, level in enumerate(series.levels)]
-    if len(levels) < 2:
-        return "crop it, or use a machine with more"
+    pages = [level.keyframe for level in series.levels]
+    if len(pages) < 2:
+        return CROP
+    names = [f"{k} ({page.imagewidth}×{page.imagelength})" for k, page in enumerate(pages)]
+    room = available() or math.inf
+    best = next((k for k, level in enumerate(series.levels) if k and level.size * size <= room), len(pages) - 1)
+    (_, down, across), unit = found
+    factor = UNITS[unit] * pages[0].imagewidth / pages[best].imagewidth
+    scale_of = f"resolution=({1 / (across * factor):.9g}, {1 / (down * factor):.9g})"
     return (
-        f"it also has {', '.join(levels[1:])}; save one of them and give that: tifffile.imwrite('level.tif', "
-        f"tifffile.imread('{path}', level={len(levels) - 1}))"
+        f"save one of its smaller levels {', '.join(names[1:])} and give that: import tifffile; "
+        f"tifffile.imwrite('level.tif', tifffile.imread('{path}', level={best}), imagej=True, {scale_of}, "
+        f"metadata={{'unit': '{_NAMES.get(unit, unit)}'}})"
     )
 
 
