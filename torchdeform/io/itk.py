@@ -32,8 +32,12 @@ _NIFTI_UNITS, _SPACE_BITS, _MICROMETRES = "xyzt_units", 7, 3
 _Result = TypeVar("_Result")
 
 
-def load(path: Path) -> "sitk.Image":
+def load(path: Path, kind: str = "") -> "sitk.Image":
     """Read a file with SimpleITK. A fourth axis is dropped if it holds only one volume.
+
+    Args:
+        path: the file.
+        kind: name of the reader of ITK, say ``PNGImageIO``; by default ITK chooses by the name of the file.
 
     Raises:
         InputError: the file is cut off, or holds a series.
@@ -43,6 +47,7 @@ def load(path: Path) -> "sitk.Image":
 
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
+    reader.SetImageIO(kind)
     with native_stderr() as printed, _no_warnings():
         image = _execute(reader)
     if any(sign in line for line in printed for sign in _DAMAGE_SIGNS):
