@@ -10,7 +10,7 @@ from torchdeform.io.kinds import kind_of
 
 WRITTEN = {
     "a.nii": "nifti", "a.nii.gz": "nifti", "a.mha": "meta", "a.mhd": "meta", "a.nrrd": "nrrd", "a.nhdr": "nrrd",
-    "a.png": "png", "a.jpg": "jpeg", "a.bmp": "bmp", "a.tif": "tiff", "a.dcm": "dicom", "a.vtk": "", "a.gipl": "",
+    "a.png": "", "a.tif": "", "a.dcm": "", "a.vtk": "", "a.gipl": "",
 }  # fmt: skip
 
 
@@ -53,10 +53,6 @@ def test_what_nibabel_writes(tmp_path, make, kind, packed):
         (gzip.compress(meta_image()), "gzip"),
         (gzip.compress(b"x" * 1000)[:20], "gzip"),
         (b"\x1f\x8bnonsense", "gzip"),
-        (b"GIF89a", "gif"),
-        (b"RIFF\x10\0\0\0WEBPVP8 ", "webp"),
-        (b"\0\0\0\x0cjP  \r\n\x87\n", "jpeg2000"),
-        (b"BM and some words", ""),
         (b"\0\0\0\1" + bytes(300), ""),
         (b"words", ""),
         (b"", ""),

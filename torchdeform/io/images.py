@@ -7,19 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import dicom, itk
 from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.io.gate import require_file
-from torchdeform.io.kinds import BMP, GZIP, JPEG, PICTURES, PNG, TIFF, kind_of
+from torchdeform.io.kinds import GZIP, kind_of
 from torchdeform.io.packed import unpack
-from torchdeform.io.tiff import read_tiff, write_tiff
-from torchdeform.io.validation import require_sound_picture
+from torchdeform.io.pictures import is_picture, picture_size, read_picture
+from torchdeform.io.tiff import can_page, is_tiff, read_tiff, tiff_size, write_tiff
 from torchdeform.io.volumes import read_volume, volume_size
 
 
@@ -50,13 +48,9 @@ FORMATS: dict[str, Format] = {
     ".nhdr": _VOLUME,
 }
 
-# Pictures that ITK may refuse (for instance grey with alpha) but scikit-image reads. They have spacing 1 in ITK too.
-_PLAIN_PICTURES = (".png", ".gif", ".webp")
-
-_READERS = {PNG: "PNGImageIO", JPEG: "JPEGImageIO", BMP: "BMPImageIO"}  # of ITK
-
-# Pixel types of volumes for which a TIFF can store the distance of its pages.
-_PAGED = ("uint8", "uint16", "float32")
+# Pictures that are not written: as PNG instead. And slides: as TIFF.
+_PICTURES = (".gif", ".webp", ".jp2", ".j2k")
+_SLIDES = (".svs", ".ndpi", ".scn", ".bif", ".qptiff", ".lsm", ".btf", ".tf8")
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:
@@ -88,14 +82,13 @@ def _read(file: Path, *, exact: bool = False) -> Image:
     if file.is_dir():
         return dicom.read_folder(file)
     require_file(file, "image file")
-    kind = kind_of(file)
     if dicom.is_dicom(file):
         return dicom.read_file(file)
-    if kind == TIFF:
+    if is_tiff(file):
         return read_tiff(file)
-    if kind in PICTURES:
-        return _read_picture(file, kind)
-    if kind == GZIP:
+    if is_picture(file):
+        return read_picture(file)
+    if kind_of(file) == GZIP:
         return _read_gzip(file, exact=exact)
     return itk.volume_image(read_volume(file), str(file), exact=exact)
 
@@ -116,37 +109,6 @@ def _read_gzip(path: Path, *, exact: bool) -> Image:
             raise InputError(str(error).replace(str(unpacked), str(path))) from error
 
 
-def _read_picture(path: Path, kind: str) -> Image:
-    require_sound_picture(path, kind)
-    try:
-        image = itk.to_image(itk.load(path, _READERS.get(kind, "")), str(path))
-    except RuntimeError:
-        return _read_otherwise(path)
-    return replace(image, unit="px") if set(image.grid.spacing) == {1.0} else image
-
-
-def _read_otherwise(path: Path) -> Image:
-    """Read with scikit-image a picture that ITK refuses, or say why the file cannot be read."""
-    from skimage.io import imread
-
-    try:
-        pixels = imread(path)
-    except (OSError, ValueError, SyntaxError, RuntimeError) as error:
-        raise InputError(f"{path} cannot be read as an image; it may be damaged: export it again") from error
-    return _picture(pixels[0] if len(pixels) == 1 else pixels, str(path))
-
-
-def _picture(values: NDArray[np.generic], name: str) -> Image:
-    """Return pixels (y, x) or (y, x, channels) as an image. Grey with alpha becomes RGBA."""
-    pixels = values.reshape(*values.shape, 1) if values.ndim == 2 else values
-    if pixels.ndim != 3:
-        raise InputError(f"{name} is a series of {len(values)} pictures; save one of them and give that")
-    if pixels.shape[-1] == 2:
-        pixels = pixels[..., [0, 0, 0, 1]]
-    data = torch.from_numpy(np.moveaxis(pixels, -1, 0).astype(np.float32)).unsqueeze(0)
-    return Image(data, Grid(pixels.shape[:2]), name=name, pixel_type=values.dtype.name, unit="px")
-
-
 def write_image(image: Image, path: str | os.PathLike[str]) -> None:
     """Write an image with its position in the world, in the format of the file's ending.
 
@@ -162,8 +124,8 @@ def write_image(image: Image, path: str | os.PathLike[str]) -> None:
         The file appears complete or not at all.
     """
     file = Path(path)
-    pixels, paged = _stored(image, file), suffix(file) in (".tif", ".tiff") and image.grid.dim == 3
-    if paged and pixels.dtype.name in _PAGED:
+    pixels = _stored(image, file)
+    if suffix(file) in (".tif", ".tiff") and can_page(pixels, image.grid.dim):
         with atomic_folder(file.parent) as folder:
             write_tiff(pixels, list(map(image.in_unit, image.grid.spacing)), image.unit, folder / file.name)
     else:
@@ -215,7 +177,7 @@ def can_hold(ending: str, image: Image) -> bool:
 def ending_like(path: Path, image: Image) -> str:
     """Return the ending that stores ``image`` like the file ``path``, ``.nii.gz`` if that format cannot hold it."""
     ending = suffix(path)
-    endings = (ending, ".png") if ending in _PLAIN_PICTURES else (ending,)
+    endings = (ending, ".png") if ending in _PICTURES else (ending, ".tif") if ending in _SLIDES else (ending,)
     return next((e for e in endings if can_hold(e, image)), ".nii.gz")
 
 
@@ -223,24 +185,31 @@ def image_size(path: Path) -> tuple[tuple[int, ...], int] | None:
     """Return the shape (z, y, x; without axes of one sample) and the channels of an image file, None if unknown.
 
     Args:
-        path: a file, or a folder of DICOM slices, which are all counted as one series.
+        path: a file, or a folder with a DICOM series.
 
     Notes:
         Reads no pixels, so the file may still be damaged. What is packed with gzip is unknown, but for NIfTI and MGH.
     """
     try:
-        files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
-        for file in files[:1]:
-            require_file(file, "image file")
-        found = volume_size(files[0]) if files else None
-    except InputError:
+        require_file(path, "image file", folder=True)
+        found = _size(path)
+    except InputError:  # reading will say why
         return None
     if found is None:
         return None
-    size, channels = found
-    slices = (len(files),) if len(files) > 1 else ()
-    shape = tuple(n for n in (*slices, *size[::-1]) if n > 1)
-    return (shape, channels) if len(shape) in (2, 3) else None
+    shape = tuple(n for n in found[0] if n > 1)
+    return (shape, found[1]) if len(shape) in (2, 3) else None
+
+
+def _size(path: Path) -> tuple[tuple[int, ...], int] | None:
+    if path.is_dir() or dicom.is_dicom(path):
+        return dicom.size(path)
+    if is_tiff(path):
+        return tiff_size(path)
+    if is_picture(path):
+        return picture_size(path)
+    found = volume_size(path)
+    return found and (found[0][::-1], found[1])
 
 
 def read_labels(path: str | os.PathLike[str]) -> Image:

@@ -27,13 +27,6 @@ if TYPE_CHECKING:
 _WIDE = ("int32", "uint32", "int64", "uint64", "float64")
 
 
-def values(path: Path) -> NDArray[np.generic]:
-    """Return the pixels of a file as SimpleITK gives them, channels last; raises like `load`."""
-    import SimpleITK as sitk
-
-    return sitk.GetArrayFromImage(load(path))
-
-
 def save(image: "sitk.Image", path: Path) -> None:
     """Write a file with SimpleITK, complete or not at all, compressed if the format can.
 
@@ -42,11 +35,12 @@ def save(image: "sitk.Image", path: Path) -> None:
     """
     import SimpleITK as sitk
 
-    try:
-        with atomic_folder(path.parent) as folder, native_stderr(), no_warnings():
+    with atomic_folder(path.parent) as folder, native_stderr(), no_warnings():
+        try:
             sitk.WriteImage(image, str(folder / path.name), useCompression=True)
-    except RuntimeError as error:
-        raise InputError(f"{path.name} cannot be written: {reason(error)}; choose another format or folder") from error
+        except RuntimeError as error:
+            said = f"{path.name} cannot be written: {reason(error)}; choose another format or folder"
+            raise InputError(said) from error
 
 
 def to_image(itk: "sitk.Image", name: str) -> Image:

@@ -1,4 +1,4 @@
-"""What a file holds, by its content: names lie, and files from downloads and archives often have none."""
+"""Which volume a file holds, by its content: names lie, and files from downloads and archives often have none."""
 
 import gzip
 import re
@@ -9,28 +9,10 @@ from pathlib import Path
 from torchdeform.io.files import read_head
 from torchdeform.io.packed import is_packed
 
-DICOM, TIFF, NIFTI, ANALYZE, MGH, META, NRRD, GZIP = "dicom", "tiff", "nifti", "analyze", "mgh", "meta", "nrrd", "gzip"
-PNG, JPEG, GIF, WEBP, BMP, JPEG2000 = "png", "jpeg", "gif", "webp", "bmp", "jpeg2000"
-PICTURES = (PNG, JPEG, GIF, WEBP, BMP, JPEG2000)
-UNKNOWN = ""
+NIFTI, ANALYZE, MGH, META, NRRD, GZIP, UNKNOWN = "nifti", "analyze", "mgh", "meta", "nrrd", "gzip", ""
 
 _HEAD = 4096  # bytes that tell the kind
-_MAGIC = (
-    (0, b"NRRD", NRRD),
-    (0, b"\x89PNG", PNG),
-    (0, b"\xff\xd8\xff", JPEG),
-    (0, b"GIF8", GIF),
-    (0, b"\0\0\0\x0cjP  ", JPEG2000),
-    (0, b"\xff\x4f\xff\x51", JPEG2000),
-    (8, b"WEBP", WEBP),
-    (0, b"II*\0", TIFF),
-    (0, b"MM\0*", TIFF),
-    (0, b"II+\0", TIFF),
-    (0, b"MM\0+", TIFF),
-    (128, b"DICM", DICOM),
-)
 _META = re.compile(rb"^\s*(ObjectType|NDims)\s*[=:]", re.MULTILINE)
-_BMP_HEADERS = (12, 40, 52, 56, 64, 108, 124)  # bytes of the second header
 _MGH_TYPES = (0, 1, 3, 4)
 
 
@@ -38,7 +20,7 @@ def kind_of(path: Path) -> str:
     """Return the kind of a file, one of the names above; ``gzip`` for a packed one that must be unpacked first.
 
     Notes:
-        Packed NIfTI and MGH are NIfTI and MGH: their readers unpack. Of other formats of ITK nothing is known here.
+        Packed NIfTI and MGH are NIfTI and MGH: their readers unpack.
     """
     if not is_packed(path):
         return _kind(read_head(path, _HEAD))
@@ -59,10 +41,9 @@ def _unpacked_head(path: Path) -> bytes:
 
 
 def _kind(head: bytes) -> str:
-    for start, magic, kind in _MAGIC:
-        if head[start:].startswith(magic):
-            return kind
-    return _nifti(head) or _mgh(head) or _bmp(head) or (META if _META.search(head) else UNKNOWN)
+    if head.startswith(b"NRRD"):
+        return NRRD
+    return _nifti(head) or _mgh(head) or (META if _META.search(head) else UNKNOWN)
 
 
 def _nifti(head: bytes) -> str:
@@ -85,7 +66,3 @@ def _mgh(head: bytes) -> str:
         return UNKNOWN
     version, *sizes, kind = struct.unpack_from(">6i", head)
     return MGH if version == 1 and min(sizes) > 0 and kind in _MGH_TYPES else UNKNOWN
-
-
-def _bmp(head: bytes) -> str:
-    return BMP if head.startswith(b"BM") and int.from_bytes(head[14:18], "little") in _BMP_HEADERS else UNKNOWN

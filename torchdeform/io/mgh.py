@@ -8,9 +8,9 @@ import numpy as np
 
 from torchdeform.errors import InputError
 from torchdeform.io.gate import DAMAGED, require_room
-from torchdeform.io.nifti import NOT_FINITE, place
+from torchdeform.io.nifti import place
 from torchdeform.io.packed import opened
-from torchdeform.io.volume import Volume, require_one
+from torchdeform.io.volume import NOT_FINITE, Volume, require_one
 
 _WIDTHS = {0: 1, 1: 4, 3: 4, 4: 2}  # bytes of a number, by FreeSurfer's code of its type
 

@@ -12,9 +12,7 @@ from torchdeform.errors import InputError
 from torchdeform.io.files import suffix
 from torchdeform.io.gate import DAMAGED, require_beside, require_room
 from torchdeform.io.packed import Stream, opened
-from torchdeform.io.volume import Volume, require_one
-
-NOT_FINITE = "has pixels that are NaN or infinite; replace them first, for instance by 0"
+from torchdeform.io.volume import NOT_FINITE, Volume, require_one
 
 _CHUNK = 1 << 22  # bytes read at once
 _LONGEST_TAIL = 64_000_000  # bytes behind the pixels that are read, for the checksum at the end of a packed file

@@ -6,7 +6,7 @@ from pathlib import Path
 from torchdeform.errors import InputError
 from torchdeform.io.dicom import is_dicom
 from torchdeform.io.gate import require_beside, require_file
-from torchdeform.io.kinds import TIFF, kind_of
+from torchdeform.io.tiff import is_tiff
 from torchdeform.io.volumes import volume_files
 
 _OME_NAMES = re.compile(r'(?:FileName|MetadataFile)="([^"]{1,255})"')
@@ -32,7 +32,7 @@ def files_of(path: Path) -> list[Path]:
         return sorted(file for file in path.iterdir() if file.is_file() and is_dicom(file))
     if is_dicom(path):
         return files_of(path.parent)
-    named = _named_by_tiff(path) if kind_of(path) == TIFF else _named_by_header(path)
+    named = _named_by_tiff(path) if is_tiff(path) else _named_by_header(path)
     return sorted({path, *(file for file in named if _is_beside(file, path))})
 
 

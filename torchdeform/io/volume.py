@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torchdeform.errors import InputError
 
 NOT_SQUARE = "has axes that are not at right angles; reslice it onto a rectangular grid first"
+NOT_FINITE = "has pixels that are NaN or infinite; replace them first, for instance by 0"
 
 # How much the products of the columns of a direction matrix may deviate from those of right angles: headers with three
 # digits deviate by up to this much. Less than the second number is left as it is.
