@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import dicom, itk
-from torchdeform.io.files import atomic_folder, suffix
+from torchdeform.io.files import atomic_folder, is_tiff, suffix
 from torchdeform.io.gate import DAMAGED
 from torchdeform.io.pictures import is_picture, picture_size, read_picture
-from torchdeform.io.tiff import can_page, is_tiff, read_tiff, tiff_size, write_tiff
+from torchdeform.io.tiff import can_page, read_tiff, tiff_size, write_tiff
 from torchdeform.io.validation import NOT_SQUARE, other_kind, require_sound
 
 
@@ -223,9 +223,9 @@ def image_size(path: Path) -> tuple[tuple[int, ...], int] | None:
     """
     import SimpleITK as sitk
 
-    files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
-    if path.is_file() and (is_tiff(path) or is_picture(path)):
-        return _picture_size(path)
+    files = sorted(p for p in (path.iterdir() if path.is_dir() else [path]) if p.is_file())
+    if files and (is_tiff(files[0]) or is_picture(files[0])):
+        return _picture_size(path) if path.is_file() else None
     reader = sitk.ImageFileReader()
 
     def read_header() -> tuple[tuple[int, ...], int]:

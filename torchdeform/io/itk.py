@@ -13,7 +13,7 @@ from torch import Tensor
 from torchdeform.core.grid import Grid, slabs
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.io.files import atomic_folder, native_stderr
+from torchdeform.io.files import atomic_folder, is_tiff, native_stderr
 from torchdeform.io.gate import DAMAGED
 from torchdeform.io.validation import NOT_SQUARE
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import SimpleITK as sitk
 
 # What the libraries below ITK print, instead of raising an error, when a file is cut off.
-_DAMAGE_SIGNS = ("TIFFReadDirectory", "TIFFFetchDirectory", "TIFFFillStrip", "not read completely")
+_DAMAGE_SIGNS = ("not read completely",)
 
 # How much the columns of a direction matrix may deviate from unit length and right angles.
 _SQUARE = 1e-3
@@ -40,28 +40,23 @@ def load(path: Path, kind: str = "") -> "sitk.Image":
         kind: name of the reader of ITK, say ``PNGImageIO``; by default ITK chooses by the name of the file.
 
     Raises:
-        InputError: the file is cut off, or holds a series.
+        InputError: the file is cut off, holds a series, or is a TIFF, at which ITK may crash: see `tiff`.
         RuntimeError: ITK cannot read it, in ITK's own words; the caller may try another reader.
     """
     import SimpleITK as sitk
 
+    if is_tiff(path):
+        raise InputError(f"{path} is a TIFF, which cannot hold what is needed here; convert it to .nii.gz")
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     reader.SetImageIO(kind)
-    with native_stderr() as printed, _no_warnings():
+    with native_stderr(stdout=True) as printed, _no_warnings():
         image = _execute(reader)
     if any(sign in line for line in printed for sign in _DAMAGE_SIGNS):
         raise InputError(f"{path} {DAMAGED}")
     if isinstance(image, RuntimeError):
         raise image
     return image
-
-
-def values(path: Path) -> NDArray[np.generic]:
-    """Return the pixels of a file as SimpleITK gives them, channels last; raises like `load`."""
-    import SimpleITK as sitk
-
-    return sitk.GetArrayFromImage(load(path))
 
 
 def _execute(reader: "sitk.ImageFileReader") -> "sitk.Image | RuntimeError":

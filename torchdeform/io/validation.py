@@ -78,17 +78,6 @@ def other_kind(path: Path) -> str:
     return "" if suffix(path).endswith(kind) or kind == _ALIKE.get(suffix(path)) else kind
 
 
-def _check_jpeg(path: Path) -> str | None:
-    """The end of the image (FF D9) must follow the last scan (FF DA). Neither occurs inside coded pixels."""
-    content = path.read_bytes()
-    return None if content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda") else DAMAGED
-
-
-def _check_bmp(path: Path) -> str | None:
-    """The header holds the size of the file."""
-    return None if int.from_bytes(read_head(path, 6)[2:], "little") <= path.stat().st_size else DAMAGED
-
-
 def _check_nifti(path: Path) -> str | None:
     try:
         with path.open("rb") if suffix(path) == ".nii" else gzip.open(path) as file:
@@ -265,9 +254,6 @@ def _unpacked_length(path: Path, start: int) -> int:
 
 
 _CHECKS: dict[str, Callable[[Path], str | None]] = {
-    ".jpg": _check_jpeg,
-    ".jpeg": _check_jpeg,
-    ".bmp": _check_bmp,
     ".mha": _check_metaimage,
     ".mhd": _check_metaimage,
     ".nrrd": _check_nrrd,
