@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import dicom, itk
-from torchdeform.io.files import atomic_folder, suffix
+from torchdeform.io.files import atomic_folder, is_tiff, suffix
 from torchdeform.io.gate import require_file
 from torchdeform.io.kinds import GZIP, kind_of
 from torchdeform.io.packed import unpack
 from torchdeform.io.pictures import is_picture, picture_size, read_picture
-from torchdeform.io.tiff import can_page, is_tiff, read_tiff, tiff_size, write_tiff
+from torchdeform.io.tiff import can_page, read_tiff, tiff_size, write_tiff
 from torchdeform.io.volumes import read_volume, volume_size
 
 

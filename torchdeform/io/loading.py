@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from torchdeform.errors import InputError
-from torchdeform.io.files import native_stderr
+from torchdeform.io.files import is_tiff, native_stderr
 from torchdeform.io.gate import DAMAGED
 from torchdeform.io.volume import Volume, require_one
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import SimpleITK as sitk
 
 # What the libraries below ITK print, instead of raising an error, when a file is cut off.
-_DAMAGE_PRINTED = ("TIFFReadDirectory", "TIFFFetchDirectory", "TIFFFillStrip", "not read completely")
+_DAMAGE_PRINTED = ("not read completely",)
 
 # What the readers of ITK say about a file that is cut off, each in its own words.
 _DAMAGE_SAID = (
@@ -38,10 +38,12 @@ def load(path: Path, reader: str = "") -> "sitk.Image":
         reader: the name of ITK's reader; by default the one that takes the file.
 
     Raises:
-        InputError: the file is cut off, or holds a series.
+        InputError: the file is cut off, holds a series, or is a TIFF, at which ITK may crash: see `tiff`.
         RuntimeError: ITK cannot read it, in ITK's own words; the caller may try another reader.
     """
-    with native_stderr() as printed, no_warnings():
+    if is_tiff(path):
+        raise InputError(f"{path} is a TIFF, which cannot hold what is needed here; convert it to .nii.gz")
+    with native_stderr(stdout=True) as printed, no_warnings():
         image = _execute(_reader(path, reader))
     if any(sign in line for line in printed for sign in _DAMAGE_PRINTED):
         raise InputError(f"{path} {DAMAGED}")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from torchdeform.errors import InputError
 from torchdeform.io.dicom import is_dicom
+from torchdeform.io.files import is_tiff
 from torchdeform.io.gate import require_beside, require_file
-from torchdeform.io.tiff import is_tiff
 from torchdeform.io.volumes import volume_files
 
 _OME_NAMES = re.compile(r'(?:FileName|MetadataFile)="([^"]{1,255})"')
