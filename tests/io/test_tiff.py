@@ -129,6 +129,15 @@ def test_the_tiny_file_is_sound(tmp_path):
     assert read_image(tmp_path / "a.tif").data.flatten().tolist() == list(range(64))
 
 
+def test_bits_from_the_right(tmp_path):
+    """FillOrder 2."""
+    (tmp_path / "a.tif").write_bytes(tiny(t258=1, t266=2, t279=8))
+    with PIL.open(tmp_path / "a.tif") as picture:
+        wanted = np.asarray(picture)
+    assert np.array_equal(read_image(tmp_path / "a.tif").data[0, 0].numpy(), wanted)
+    assert wanted[1].tolist() == [1, 0, 0, 0, 0, 0, 0, 0]
+
+
 @pytest.mark.parametrize(
     "tags",
     [

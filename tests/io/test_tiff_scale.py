@@ -142,3 +142,15 @@ def test_geotiff_is_no_scale(tmp_path):
     tag = (33550, 12, 3, (30.0, 30.0, 0.0), True)
     tifffile.imwrite(tmp_path / "a.tif", values(), extratags=[tag], metadata=None)
     assert scale(tmp_path / "a.tif") == ((1.0, 1.0), "px")
+
+
+def test_philips_says_the_spacing(tmp_path):
+    levels = "".join(
+        f'<Attribute Name="DICOM_PIXEL_SPACING" Element="0x0030">&quot;{h}&quot; &quot;{h}&quot;</Attribute>'
+        for h in ("0.0005", "0.00025")
+    )
+    text = f'<?xml version="1.0"?><DataObject ObjectType="DPUfsImport">{levels}</DataObject>'
+    tifffile.imwrite(tmp_path / "a.tiff", values(), description=text, software="Philips DP v1.0", metadata=None)
+    spacing, unit = scale(tmp_path / "a.tiff")
+    np.testing.assert_allclose(spacing, (0.25e-3, 0.25e-3))
+    assert unit == "µm"
