@@ -113,4 +113,5 @@ def overview(work: Plan, costs: Costs) -> str:
     }
     if costs.unknown:
         sums["unknown"] = f"{costs.unknown} pairs whose size is unknown before they run, not counted"
-    return "\n".join([*pairs, *problems, table(sums)])
+    unreadable = [f"likely to fail: {name}: {why}" for name, why in costs.unreadable.items()]
+    return "\n".join([*pairs, *problems, *unreadable, table(sums)])

@@ -15,6 +15,7 @@ from torchdeform.cohort.schema import Cohort
 from torchdeform.errors import InputError, nearest_name
 from torchdeform.io import read_displacement, read_image
 from torchdeform.io.files import atomic_folder
+from torchdeform.io.gate import require_file, require_name
 from torchdeform.io.transforms import write_voxel_displacement
 from torchdeform.pipeline.register import Outcome, PairFiles, register_files
 from torchdeform.registration.result import Callback
@@ -61,6 +62,7 @@ _RESERVED = (
 )
 
 _POINTS = ("fixed_points", "moving_points")
+_WHAT = {"mask": "mask", "labels": "label image", "points": "file of landmarks"}
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ def plan(cohort: Cohort) -> Plan:
     jobs: list[Job] = []
     problems: list[Failure] = []
     for pair in found:
-        sentence = pair.problem or _missing(pair)
+        sentence = pair.problem or _missing(pair) or _leading_out(pair, cohort.out)
         if sentence:
             problems.append(Failure(pair.name, sentence))
         else:
@@ -177,13 +179,26 @@ def _resolver(cohort: Cohort) -> Callable[[PairSpec], RegistrationSettings]:
 def _missing(pair: PairSpec) -> str:
     """Return a sentence about the files that a pair lacks, empty if there are all."""
     for key, path in pair.files.items():
-        if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises if a folder may not be read
-            return f"{key} {path} does not exist; check {pair.where}"
+        try:
+            require_name(path)
+            if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises if a folder may not be read
+                return f"{key} {path} does not exist; check {pair.where}"
+            require_file(path, _WHAT.get(key.partition("_")[2], "image file"), folder=True)
+        except InputError as error:
+            return f"{key} {error}; see {pair.where}"
     for what in ("points", "labels"):
         given = [side for side in ("fixed", "moving") if f"{side}_{what}" in pair.files]
         if len(given) == 1:
             other = {"fixed": "moving", "moving": "fixed"}[given[0]]
             return f"{given[0]}_{what} needs {other}_{what} too, give both or neither; check {pair.where}"
+    return ""
+
+
+def _leading_out(pair: PairSpec, out: Path) -> str:
+    """Return a sentence about the folder of a pair if it is not inside of ``out``, empty if it is."""
+    place = out / pair.subject / pair.name
+    if place.resolve() == out.resolve() or not place.resolve().is_relative_to(out.resolve()):
+        return f"its folder {place} leads out of {out}; remove the link there, or choose another out"
     return ""
 
 
