@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from torchdeform.cli.options import Quiet, flag, say_written, table
-from torchdeform.cli.progress import CohortProgress, stoppable
+from torchdeform.cli.progress import CohortProgress
 from torchdeform.cohort.estimate import Costs, estimate
 from torchdeform.cohort.page import BADGES, VERDICTS
 from torchdeform.cohort.plan import DESCRIPTION, Plan, description, plan
@@ -59,7 +59,7 @@ def batch(
         typer.echo(overview(work, estimate(work.jobs)))
         return
     how = {"resume": resume, "retry_failed": retry_failed}
-    with stoppable("batch"), CohortProgress(quiet) as progress:
+    with CohortProgress(quiet) as progress:
         summary = _run(work, whole, cohort.engine, progress, how)
     if not quiet:
         typer.echo(outcome(summary))
