@@ -98,7 +98,9 @@ def preflight(
         Images are compared on coarse grids and every voxel is read only for its value: less than a second at 128³.
     """
     settings = settings or RegistrationSettings()
+    given = [image for image in (fixed, moving, fixed_mask, moving_mask) if image is not None]
     found = [
+        *(Finding(WARNING, text) for image in given for text in image.remarks),
         *_check_values(fixed),
         *_check_values(moving),
         *_check_nodes(fixed, ERROR),
