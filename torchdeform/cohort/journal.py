@@ -134,7 +134,7 @@ class Journal:
             "memory": job.memory,
             "report": job.report,
             "voxels": job.voxels,
-            "submission": None if job.submission is None else job.submission.name,
+            "submission": [path.name for path in (job.submission, *job.also) if path is not None],
             "inputs": inputs,
         }
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

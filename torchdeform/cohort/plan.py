@@ -2,13 +2,14 @@
 
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from torchdeform import __version__
-from torchdeform.cohort.learn2reg import submission_name
+from torchdeform.cohort.learn2reg import submission_names
 from torchdeform.cohort.names import PairSpec, select
 from torchdeform.cohort.pairs import pair_specs
 from torchdeform.cohort.schema import Cohort
@@ -34,6 +35,7 @@ class Job:
         memory: limit in bytes, None for all that is free.
         report: ``none``, ``light`` or ``full``, see `register_files`.
         submission: file for the displacement as the Learn2Reg challenge reads it, None for none.
+        also: further names of that file, which other versions of the challenge's evaluation look for.
         voxels: whether landmarks are rows of voxel indices without titles, as in Learn2Reg.
     """
 
@@ -44,6 +46,7 @@ class Job:
     memory: int | None = None
     report: str = "light"
     submission: Path | None = None
+    also: tuple[Path, ...] = ()
     voxels: bool = False
 
 
@@ -119,7 +122,7 @@ def plan(cohort: Cohort) -> Plan:
     _require_apart(found, lambda pair: f"{pair.subject}/{pair.name}", "be called", "name")
     if cohort.layout == "learn2reg":
         whole = [pair for pair in found if not pair.problem]
-        _require_apart(whole, _submission, "be submitted as", "moving image")
+        _require_apart(whole, lambda pair: _submissions(pair)[0], "be submitted as", "moving image")
     resolve = _resolver(cohort)
     jobs: list[Job] = []
     problems: list[Failure] = []
@@ -204,6 +207,8 @@ def _leading_out(pair: PairSpec, out: Path) -> str:
 
 def _job(pair: PairSpec, cohort: Cohort, settings: RegistrationSettings) -> Job:
     files = PairFiles(**pair.files, out=cohort.out / pair.subject / pair.name)
+    names = _submissions(pair) if cohort.layout == "learn2reg" else ()
+    submission, *also = [cohort.out / SUBMISSION / name for name in names] or [None]
     return Job(
         name=pair.name,
         files=files,
@@ -211,13 +216,14 @@ def _job(pair: PairSpec, cohort: Cohort, settings: RegistrationSettings) -> Job:
         device=cohort.device,
         memory=cohort.memory,
         report=cohort.report,
-        submission=cohort.out / SUBMISSION / _submission(pair) if cohort.layout == "learn2reg" else None,
+        submission=submission,
+        also=tuple(also),
         voxels=pair.voxels and pair.files.keys() >= {*_POINTS},
     )
 
 
-def _submission(pair: PairSpec) -> str:
-    return submission_name(pair.files["fixed"], pair.files["moving"])
+def _submissions(pair: PairSpec) -> tuple[str, ...]:
+    return submission_names(pair.files["fixed"], pair.files["moving"])
 
 
 def register_job(job: Job, *, callback: Callback | None = None) -> Outcome:
@@ -234,7 +240,18 @@ def register_job(job: Job, *, callback: Callback | None = None) -> Outcome:
         displacement = read_displacement(outcome.folder / "displacement.nii.gz")
         fixed, moving = read_image(files.fixed), read_image(files.moving)
         write_voxel_displacement(displacement.data, fixed, moving, job.submission)
+        for path in job.also:
+            _write_again(job.submission, path)
     return outcome
+
+
+def _write_again(file: Path, name: Path) -> None:
+    """Give a file another name, or make a copy of it where a file cannot have two."""
+    with atomic_folder(name.parent) as folder:
+        try:
+            (folder / name.name).hardlink_to(file)
+        except OSError:
+            shutil.copyfile(file, folder / name.name)
 
 
 def _with_titles(files: PairFiles) -> PairFiles:
