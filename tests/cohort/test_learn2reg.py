@@ -1,5 +1,6 @@
 """Data sets of the Learn2Reg challenge: which pairs they list, what goes along, how submissions are called."""
 
+import errno
 import json
 
 import nibabel
