@@ -123,12 +123,14 @@ class _Inflater:
 
 def sizes(path: Path, text: str, rank: str) -> tuple[int, ...]:
     """Return the sizes of the axes; `InputError` unless they are as many positive whole numbers as ``rank`` says."""
+    if rank and not rank.isdecimal():
+        raise InputError(f"{path} has the number of axes '{rank[:80]}' in its header; correct the header")
     found = text.split()
     positive = all(_COUNT.fullmatch(size) and int(size) > 0 for size in found)
     if not positive or not 1 <= len(found) <= _MOST_AXES or (rank and rank != str(len(found))):
-        count = rank if rank.isdecimal() else "1 to 5"
         raise InputError(
-            f"{path} has the size '{text[:80]}' in its header, not {count} positive whole numbers; correct the header"
+            f"{path} has the size '{text[:80]}' in its header, not {rank or '1 to 5'} positive whole numbers; correct the "
+            "header"
         )
     return tuple(map(int, found))
 

@@ -18,13 +18,10 @@ from torchdeform.io.loading import load as load
 from torchdeform.io.loading import no_warnings
 from torchdeform.io.loading import quietly as quietly
 from torchdeform.io.loading import reason as reason
-from torchdeform.io.volume import Volume, squared
+from torchdeform.io.volume import Volume, held_type, squared
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
-
-# Types whose values float32, in which images are read, cannot all represent.
-_WIDE = ("int32", "uint32", "int64", "uint64", "float64")
 
 
 def save(image: "sitk.Image", path: Path) -> None:
@@ -68,7 +65,7 @@ def volume_image(volume: Volume, name: str, *, exact: bool = False) -> Image:
     shape = tuple(n for n in volume.size[::-1] if n > 1)
     if len(shape) < 2:
         raise InputError(f"{name} has size {list(volume.size)}; give an image with at least two axes")
-    kind = np.float64 if exact and values.dtype.name in _WIDE else np.float32
+    kind = held_type(values.dtype, exact=exact)
     with np.errstate(over="ignore"):
         data = torch.from_numpy(np.ascontiguousarray(values, dtype=kind).reshape(1, *shape, values.shape[-1]))
     grid = Grid(shape, tuple(reversed(spacing)))

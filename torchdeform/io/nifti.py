@@ -43,6 +43,7 @@ _UNITS = {1: (1e3, "mm"), 3: (1e-3, "µm")}
 
 _LPS = np.array([[-1.0], [-1.0], [1.0]])  # signs that take RAS, NIfTI's world, to LPS
 
+_SINGULAR = 1e-6  # volume of the cell of three unit vectors that lie in a plane
 _ROUNDED = 5e-3  # share by which two lengths of a header may differ that are the same but for rounding
 _NO_ROTATION = 1.01  # squared length of a quaternion's last three numbers that rounding does not explain
 _APART = 0.25  # of a voxel, by which qform and sform may differ in silence
@@ -208,7 +209,7 @@ def _scaled(values: NDArray[np.generic], header: _Header) -> NDArray[np.generic]
         return values
     if not math.isfinite(inter):
         raise InputError(f"{header.path} has the intercept {inter} in its header; correct the header")
-    with np.errstate(over="ignore"):
+    with np.errstate(all="ignore"):  # what is not finite is refused later
         found = slope * values.astype(np.float64) + inter
         return found if values.dtype.itemsize > 4 else found.astype(np.float32)
 
@@ -284,8 +285,10 @@ def place(values: NDArray[np.generic], rows: NDArray[np.float64], path: Path) ->
         if size[axis] == 1 and not columns[:, axis].any():
             columns[:, axis] = np.cross(columns[:, axis - 2], columns[:, axis - 1])
             columns[:, axis] /= max(np.linalg.norm(columns[:, axis]), np.finfo(float).tiny)
-    lengths = np.linalg.norm(columns, axis=0)
-    if not lengths.all() or abs(np.linalg.det(columns / lengths)) < 1e-6:
+    with np.errstate(all="ignore"):
+        lengths = np.linalg.norm(columns, axis=0)
+        volume = abs(np.linalg.det(columns / lengths))
+    if not (np.isfinite(lengths).all() and lengths.all() and volume > _SINGULAR):
         raise InputError(f"{path} has an affine that is singular; correct its header")
     values = values.reshape(*size[::-1], -1)
     return Volume(values, tuple(lengths.tolist()), tuple(origin), columns / lengths)
