@@ -129,8 +129,8 @@ def sizes(path: Path, text: str, rank: str) -> tuple[int, ...]:
     positive = all(_COUNT.fullmatch(size) and int(size) > 0 for size in found)
     if not positive or not 1 <= len(found) <= _MOST_AXES or (rank and rank != str(len(found))):
         raise InputError(
-            f"{path} has the size '{text[:80]}' in its header, not {rank or '1 to 5'} positive whole numbers; correct the "
-            "header"
+            f"{path} has the size '{text[:80]}' in its header, not {rank or '1 to 5'} positive whole numbers; "
+            "correct the header"
         )
     return tuple(map(int, found))
 
