@@ -43,37 +43,6 @@ def test_jpeg_inside_is_read_in_colour(tmp_path):
     assert np.abs(image.data[0].numpy() - np.moveaxis(pixels, -1, 0)).mean() < 20
 
 
-@pytest.mark.parametrize(
-    ("unit", "known"), [("mm", 1.0), ("um", 1e-3), ("micron", 1e-3), ("cm", 10.0), ("pixel", None)]
-)
-def test_imagej_says_the_spacing(tmp_path, unit, known):
-    millimetres = known or 1.0
-    where = {"axes": "ZYX", "spacing": 2.5, "unit": unit}
-    tifffile.imwrite(
-        tmp_path / "a.tif", values((5, 20, 30)), imagej=True, resolution=(1 / 0.5, 1 / 0.25), metadata=where
-    )
-    image = read_image(tmp_path / "a.tif")
-    np.testing.assert_allclose(image.grid.spacing, np.array([2.5, 0.25, 0.5]) * millimetres, rtol=1e-6)
-    assert image.unit == {1e-3: "µm", None: "px"}.get(known, "mm")
-
-
-def test_ome_says_the_spacing(tmp_path):
-    sizes = {"PhysicalSizeX": 0.5, "PhysicalSizeY": 0.25, "PhysicalSizeZ": 2.0}
-    units = {f"{key}Unit": "µm" for key in sizes}
-    tifffile.imwrite(tmp_path / "a.ome.tif", values((5, 20, 30)), metadata={"axes": "ZYX"} | sizes | units)
-    image = read_image(tmp_path / "a.ome.tif")
-    np.testing.assert_allclose(image.grid.spacing, (2e-3, 0.25e-3, 0.5e-3))
-    assert image.unit == "µm"
-
-
-@pytest.mark.parametrize(("unit", "size"), [("INCH", 25.4 / 300), ("CENTIMETER", 10 / 300), ("NONE", 1.0)])
-def test_resolution_tags_say_the_spacing(tmp_path, unit, size):
-    tifffile.imwrite(tmp_path / "a.tif", values((20, 30)), resolution=(300, 300), resolutionunit=unit)
-    image = read_image(tmp_path / "a.tif")
-    np.testing.assert_allclose(image.grid.spacing, (size, size))
-    assert image.unit == ("px" if unit == "NONE" else "mm")
-
-
 @pytest.mark.parametrize("unit", ["px", "mm", "µm"])
 def test_volumes_keep_their_unit(tmp_path, unit):
     spacing = (2.5e-3, 0.25e-3, 0.5e-3) if unit == "µm" else (2.5, 0.25, 0.5)

@@ -23,6 +23,19 @@ UNITS = {"px": 1.0, "mm": 1.0, "µm": 1000.0}
 
 _Length = TypeVar("_Length", float, Tensor)
 
+# Directions less independent than this are no axes of a space.
+_INDEPENDENT = 1e-6
+
+
+def independence(matrix: Tensor) -> float:
+    """Return how far the columns of a matrix ``(D, D)`` are from lying in a plane, whatever their lengths, 1 to 0.
+
+    Notes:
+        |det| / Π |column|: a determinant alone carries the scale of the matrix to the power of D. 1 for right angles.
+    """
+    matrix = matrix.detach().double()
+    return float((torch.linalg.det(matrix).abs() / matrix.norm(dim=0).prod()).nan_to_num(0.0))
+
 
 @dataclass(frozen=True)
 class Image:
@@ -62,7 +75,7 @@ class Image:
         require_choice(self.unit, UNITS, f"{self.name}: unit")
         if not all(map(math.isfinite, self.origin)):
             raise InputError(f"{self.name}: its origin {self.origin} is not finite; correct the header of the file")
-        if not abs(float(torch.linalg.det(torch.tensor(self.direction, dtype=torch.float64)))) > 1e-6:
+        if not independence(torch.tensor(self.direction, dtype=torch.float64)) > _INDEPENDENT:
             raise InputError(f"{self.name}: its direction matrix is singular; correct the header of the file")
 
     def to_world(self, points: Tensor) -> Tensor:

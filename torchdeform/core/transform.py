@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchdeform.core.derivatives import jacobian_determinant
 from torchdeform.core.grid import over_slabs
-from torchdeform.core.image import AUTO, Image, outside_value, overlap
+from torchdeform.core.image import AUTO, Image, independence, outside_value, overlap
 from torchdeform.core.interpolation import COPYING, LABEL_MODE, interpolator
 from torchdeform.core.warp import inside_box, invert, sample
 from torchdeform.errors import InputError
@@ -42,7 +42,7 @@ class Affine:
             raise InputError(f"Affine: matrix must be (D, D) and offset (D,) with D = 2 or 3, got {shapes}")
         if not bool(self.matrix.isfinite().all() and self.offset.isfinite().all()):
             raise InputError("Affine: matrix and offset must be finite")
-        if float(torch.linalg.det(self.matrix.detach()).abs()) == 0:
+        if independence(self.matrix) == 0:
             raise InputError("Affine: the matrix is singular; it takes a volume to a plane")
 
     @property

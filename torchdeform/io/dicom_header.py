@@ -2,24 +2,21 @@
 
 import math
 import re
-import warnings
 import zlib
-from collections.abc import Callable, Iterator, Mapping, MutableSequence, Sequence
+from collections.abc import Iterator, Mapping, MutableSequence, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchdeform.errors import InputError
 from torchdeform.io.files import read_head
-from torchdeform.io.gate import DAMAGED, require_room
+from torchdeform.io.gate import DAMAGED, reading, require_room
 
 if TYPE_CHECKING:
     from pydicom import Dataset
-
-_Result = TypeVar("_Result")
 
 # Files without the preamble start with an element of group 2 or 8: its number, then a VR or a short length.
 # Files without the preamble start with an element of group 2 or 8: its number, then a VR or a short length.
@@ -154,28 +151,16 @@ def slices(path: Path) -> list[Slice]:
     Raises:
         InputError: a damaged header; frames that are no volume: a cine, a mosaic, a slide.
     """
-    return guarded(path, lambda: _slices(path, read(path, [*_KEYWORDS, *_PASSES, _GROUPS])))
+    with reading(path):
+        return _slices(path, read(path, [*_KEYWORDS, *_PASSES, _GROUPS]))
 
 
 def no_image(path: Path) -> str:
     """Return the sentence for a DICOM file without an image."""
-    kind = guarded(path, lambda: str(read(path, ["SOPClassUID"]).get("SOPClassUID", "")))
+    with reading(path):
+        kind = str(read(path, ["SOPClassUID"]).get("SOPClassUID", ""))
     what = _ADVICE.get(kind, "no DICOM image; give an image file, or the folder of the series")
     return f"{path} holds {what}"
-
-
-def guarded(path: Path, work: Callable[[], _Result]) -> _Result:
-    """Return what ``work`` makes of a DICOM file; whatever its content provokes is an `InputError`."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about values that break the standard but can be read
-        try:
-            return work()
-        except InputError:
-            raise
-        except Exception as error:  # pydicom raises errors of a dozen types
-            if isinstance(error, OSError) and error.errno is not None:  # the machine's, not pydicom's
-                raise
-            raise InputError(f"{path} {DAMAGED}") from error
 
 
 def read(path: Path, keywords: Sequence[str] = ()) -> "Dataset":

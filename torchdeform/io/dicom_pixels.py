@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchdeform.errors import InputError
-from torchdeform.io.dicom_header import guarded, packing, read
+from torchdeform.io.dicom_header import packing, read
 from torchdeform.io.files import native_stderr
-from torchdeform.io.gate import DAMAGED, require_room
+from torchdeform.io.gate import DAMAGED, reading, require_room
 from torchdeform.io.isolated import isolated
 
 if TYPE_CHECKING:
@@ -35,7 +35,8 @@ def pixels(path: Path) -> NDArray[np.generic]:
     Notes:
         Palettes and other colours become RGB; where white is zero (MONOCHROME1) values are turned around.
     """
-    return guarded(path, lambda: _shown(path, read(path)))
+    with reading(path):
+        return _shown(path, read(path))
 
 
 def _shown(path: Path, header: "Dataset") -> NDArray[np.generic]:
@@ -92,7 +93,8 @@ def _by_gdcm(path: Path) -> NDArray[np.generic] | None:
 
     with tempfile.TemporaryDirectory() as folder:
         alone = Path(folder) / "pixels.dcm"
-        guarded(path, lambda: _write_pixels(read(path), alone))
+        with reading(path):
+            _write_pixels(read(path), alone)
         reader = sitk.ImageFileReader()
         reader.SetImageIO("GDCMImageIO")
         reader.SetFileName(str(alone))

@@ -7,19 +7,19 @@ import tempfile
 import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import dicom, itk
 from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.io.gate import DAMAGED
-from torchdeform.io.tiff import read_tiff, write_tiff
+from torchdeform.io.pictures import is_picture, picture_size, read_picture
+from torchdeform.io.tiff import can_page, is_tiff, read_tiff, tiff_size, write_tiff
 from torchdeform.io.validation import NOT_SQUARE, other_kind, require_sound
 
 
@@ -50,20 +50,15 @@ FORMATS: dict[str, Format] = {
     ".nhdr": _VOLUME,
 }
 
-# Pictures that ITK may refuse (for instance grey with alpha) but scikit-image reads. They have spacing 1 in ITK too.
-_PLAIN_PICTURES = (".png", ".gif", ".webp")
-
-# Files that have no spacing if ITK says 1.
-_PICTURES = (*_PLAIN_PICTURES, ".jpg", ".jpeg", ".bmp")
+# Pictures that are not written: as PNG instead. And slides: as TIFF.
+_PICTURES = (".gif", ".webp", ".jp2", ".j2k")
+_SLIDES = (".svs", ".ndpi", ".scn", ".bif", ".qptiff", ".lsm", ".btf", ".tf8")
 
 # What the readers of ITK say about a file that is cut off, each in its own words.
 _DAMAGE_SIGNS = ("fread got only", "inflate", "Cannot read requested file", "unexpected end")
 
 # Types whose values float32, in which images are read, cannot all represent.
 _WIDE = ("int32", "uint32", "int64", "uint64", "float64")
-
-# Pixel types of volumes for which a TIFF can store the distance of its pages.
-_PAGED = ("uint8", "uint16", "float32")
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:
@@ -93,10 +88,14 @@ def read_image(path: str | os.PathLike[str]) -> Image:
     require_sound(file)
     if dicom.is_dicom(file):
         return dicom.read_file(file)
+    if is_tiff(file):
+        return read_tiff(file)
+    if is_picture(file):
+        return read_picture(file)
     ending = suffix(file)
     if ending.endswith(".gz") and ending not in FORMATS:
         return _read_gzip(file)
-    return read_tiff(file) if ending in (".tif", ".tiff") and not other_kind(file) else _read_by_itk(file)
+    return _read_by_itk(file)
 
 
 def read_optional(path: Path | None) -> Image | None:
@@ -121,24 +120,15 @@ def _read_gzip(path: Path) -> Image:
 
 def _read_by_itk(path: Path) -> Image:
     try:
-        image = itk.to_image(itk.load(path), str(path))
+        return itk.to_image(itk.load(path), str(path))
     except RuntimeError as error:
-        return _read_otherwise(path, itk.reason(error))
-    return replace(image, unit="px") if suffix(path) in _PICTURES and set(image.grid.spacing) == {1.0} else image
+        _refuse(path, itk.reason(error))
 
 
-def _read_otherwise(path: Path, reason: str) -> Image:
-    """Read with scikit-image a picture that ITK refuses, or say why the file cannot be read."""
+def _refuse(path: Path, reason: str) -> NoReturn:
+    """Say why ITK cannot read the file."""
     if kind := other_kind(path):
         raise InputError(f"{path} holds a {kind} file under another name; rename it so that it ends in {kind}")
-    if suffix(path) in _PLAIN_PICTURES:
-        from skimage.io import imread
-
-        try:
-            pixels = imread(path)
-        except (OSError, ValueError, SyntaxError, RuntimeError) as error:
-            raise InputError(f"{path} cannot be read as an image; it may be damaged: export it again") from error
-        return _picture(pixels[0] if len(pixels) == 1 else pixels, str(path))
     if "orthonormal" in reason:
         raise InputError(f"{path} {NOT_SQUARE}")
     if any(sign in reason for sign in _DAMAGE_SIGNS):
@@ -148,17 +138,6 @@ def _read_otherwise(path: Path, reason: str) -> Image:
     if "determine ImageIO" in reason:
         raise InputError(f"{path} is no image of a known format; convert it to PNG, TIFF, NIfTI, MetaImage or NRRD")
     raise InputError(f"{path} cannot be read ({reason}); export it again, or as another format")
-
-
-def _picture(values: NDArray[np.generic], name: str) -> Image:
-    """Return pixels (y, x) or (y, x, channels) as an image. Grey with alpha becomes RGBA."""
-    pixels = values.reshape(*values.shape, 1) if values.ndim == 2 else values
-    if pixels.ndim != 3:
-        raise InputError(f"{name} is a series of {len(values)} pictures; save one of them and give that")
-    if pixels.shape[-1] == 2:
-        pixels = pixels[..., [0, 0, 0, 1]]
-    data = torch.from_numpy(np.moveaxis(pixels, -1, 0).astype(np.float32)).unsqueeze(0)
-    return Image(data, Grid(pixels.shape[:2]), name=name, pixel_type=values.dtype.name, unit="px")
 
 
 def write_image(image: Image, path: str | os.PathLike[str]) -> None:
@@ -176,8 +155,8 @@ def write_image(image: Image, path: str | os.PathLike[str]) -> None:
         The file appears complete or not at all.
     """
     file = Path(path)
-    pixels, paged = _stored(image, file), suffix(file) in (".tif", ".tiff") and image.grid.dim == 3
-    if paged and pixels.dtype.name in _PAGED:
+    pixels = _stored(image, file)
+    if suffix(file) in (".tif", ".tiff") and can_page(pixels, image.grid.dim):
         with atomic_folder(file.parent) as folder:
             write_tiff(pixels, list(map(image.in_unit, image.grid.spacing)), image.unit, folder / file.name)
     else:
@@ -229,7 +208,7 @@ def can_hold(ending: str, image: Image) -> bool:
 def ending_like(path: Path, image: Image) -> str:
     """Return the ending that stores ``image`` like the file ``path``, ``.nii.gz`` if that format cannot hold it."""
     ending = suffix(path)
-    endings = (ending, ".png") if ending in _PLAIN_PICTURES else (ending,)
+    endings = (ending, ".png") if ending in _PICTURES else (ending, ".tif") if ending in _SLIDES else (ending,)
     return next((e for e in endings if can_hold(e, image)), ".nii.gz")
 
 
@@ -243,13 +222,21 @@ def image_size(path: Path) -> tuple[tuple[int, ...], int] | None:
         Reads no pixels, so the file may still be damaged. Formats that ITK does not know are unknown here.
     """
     try:
-        found = dicom.size(path) if path.is_dir() or dicom.is_dicom(path) else _size_by_itk(path)
-    except InputError:
+        found = _size(path)
+    except InputError:  # reading will say why
         return None
     if found is None:
         return None
     shape = tuple(n for n in found[0] if n > 1)
     return (shape, found[1]) if len(shape) in (2, 3) else None
+
+
+def _size(path: Path) -> tuple[tuple[int, ...], int] | None:
+    if path.is_dir() or dicom.is_dicom(path):
+        return dicom.size(path)
+    if is_tiff(path):
+        return tiff_size(path)
+    return picture_size(path) if is_picture(path) else _size_by_itk(path)
 
 
 def _size_by_itk(path: Path) -> tuple[tuple[int, ...], int] | None:

@@ -32,8 +32,12 @@ _NIFTI_UNITS, _SPACE_BITS, _MICROMETRES = "xyzt_units", 7, 3
 _Result = TypeVar("_Result")
 
 
-def load(path: Path) -> "sitk.Image":
+def load(path: Path, kind: str = "") -> "sitk.Image":
     """Read a file with SimpleITK. A fourth axis is dropped if it holds only one volume.
+
+    Args:
+        path: the file.
+        kind: name of the reader of ITK, say ``PNGImageIO``; by default ITK chooses by the name of the file.
 
     Raises:
         InputError: the file is cut off, or holds a series.
@@ -43,6 +47,7 @@ def load(path: Path) -> "sitk.Image":
 
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
+    reader.SetImageIO(kind)
     with native_stderr() as printed, _no_warnings():
         image = _execute(reader)
     if any(sign in line for line in printed for sign in _DAMAGE_SIGNS):
@@ -93,11 +98,12 @@ def save(image: "sitk.Image", path: Path) -> None:
     """
     import SimpleITK as sitk
 
-    try:
-        with atomic_folder(path.parent) as folder, native_stderr(), _no_warnings():
+    with atomic_folder(path.parent) as folder, native_stderr(), _no_warnings():
+        try:
             sitk.WriteImage(image, str(folder / path.name), useCompression=True)
-    except RuntimeError as error:
-        raise InputError(f"{path.name} cannot be written: {reason(error)}; choose another format or folder") from error
+        except RuntimeError as error:
+            said = f"{path.name} cannot be written: {reason(error)}; choose another format or folder"
+            raise InputError(said) from error
 
 
 def reason(error: RuntimeError) -> str:

@@ -16,7 +16,7 @@ from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Stage, Transform
 from torchdeform.errors import InputError
 from torchdeform.io import elastix, itk, itk_maps, matrices
-from torchdeform.io.files import atomic_folder, native_stderr, read_head, suffix
+from torchdeform.io.files import atomic_folder, native_stderr, read_head, require_space, suffix
 from torchdeform.io.gate import require_file
 from torchdeform.io.maps import Field, Linear, Spline
 from torchdeform.io.validation import require_sound
@@ -312,6 +312,7 @@ def _save(transform: "sitk.Transform", path: Path) -> None:
     import SimpleITK as sitk
 
     with atomic_folder(path.parent) as folder:
+        require_space(folder, 8 * transform.GetNumberOfParameters())  # HDF5 cannot close a file on a full disk
         try:
             with native_stderr():
                 sitk.WriteTransform(transform, str(folder / path.name))

@@ -214,7 +214,10 @@ def _check_matrix(text: str) -> str | None:
     rank = round(math.sqrt(len(values or [])))
     if values is None or not all(map(math.isfinite, values)):
         return f"has the direction '{text}' in its header; correct the header"
-    if values and rank**2 == len(values) and abs(np.linalg.det(np.reshape(values, (rank, rank)))) < 1e-12:
+    if not values or rank**2 != len(values):
+        return None
+    matrix = np.reshape(values, (rank, rank))  # with the spacing in it in NRRD, so only what is left of it counts
+    if not abs(np.linalg.det(matrix)) > 1e-6 * np.linalg.norm(matrix, axis=1).prod():
         return "has a direction matrix that is singular; correct the header"
     return None
 

@@ -1,6 +1,7 @@
 """One pair of image files: reading and checking, registration, and the folder of results."""
 
 import json
+import re
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from time import perf_counter
@@ -38,6 +39,10 @@ RECORD = "result.json"
 REPORT = "report.html"
 OVERVIEW = "overview.png"
 THUMBNAIL = "thumb.jpg"
+DISPLACEMENT, TRANSFORM, INVERSE = "displacement.nii.gz", "transform.h5", "inverse.h5"
+
+_FIXED_NAMES = {RECORD, REPORT, OVERVIEW, THUMBNAIL, DISPLACEMENT, TRANSFORM, INVERSE}
+_WARPED = re.compile(r"warped(_labels)?(\.[A-Za-z0-9]+){1,2}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,8 +262,7 @@ def _write_results(files: PairFiles, inputs: Inputs, result: RegistrationResult,
     """Write all files of a result into the folder, or none."""
     begin("writing")
     out, start = files.out, perf_counter()
-    earlier = _earlier_files(out)
-    with atomic_folder(out) as folder:
+    with atomic_folder(out, lambda: _earlier_files(out)) as folder:
         _write_images(folder, files, inputs, result)
         written = perf_counter()
         begin("drawing")
@@ -271,8 +275,6 @@ def _write_results(files: PairFiles, inputs: Inputs, result: RegistrationResult,
         if data is not None:
             write_report(folder / REPORT, data, record)
         write_json(record, folder / RECORD)
-    for name in earlier - set(names):
-        (out / name).unlink(missing_ok=True)
     return Outcome(result, record, out)
 
 
@@ -308,9 +310,9 @@ def _write_images(folder: Path, files: PairFiles, inputs: Inputs, result: Regist
     )
     warped = replace(fixed, data=result.warped, name="warped", pixel_type=moving.pixel_type)
     write_image(warped, folder / f"warped{ending_like(files.moving, warped)}")
-    write_displacement(transform.flatten(fixed).field.data, fixed, folder / "displacement.nii.gz")
-    write_transform(transform, folder / "transform.h5")
-    write_transform(transform.inverse(), folder / "inverse.h5")
+    write_displacement(transform.flatten(fixed).field.data, fixed, folder / DISPLACEMENT)
+    write_transform(transform, folder / TRANSFORM)
+    write_transform(transform.inverse(), folder / INVERSE)
     if files.moving_labels is not None and isinstance(inputs.annotations.moving_labels, Image):
         labels = transform.labels(inputs.annotations.moving_labels, fixed)
         write_labels(labels, folder / f"warped_labels{ending_like(files.moving_labels, labels)}")
@@ -325,10 +327,18 @@ def _earlier_record(out: Path) -> dict[str, Any]:
     return record if isinstance(record, dict) else {}
 
 
+def is_result(name: object) -> bool:
+    """Return whether `register_files` writes files of this name; no others are ever removed."""
+    return isinstance(name, str) and (name in _FIXED_NAMES or _WARPED.fullmatch(name) is not None)
+
+
 def _earlier_files(out: Path) -> set[str]:
     """Return the names that an earlier run recorded in ``out``, so that none of its results stays."""
-    names = _earlier_record(out).get("files")
-    return {n for n in names if isinstance(n, str) and Path(n).name == n} if isinstance(names, list) else set()
+    record = _earlier_record(out)
+    names, made_by = record.get("files"), record.get("versions")
+    if not isinstance(names, list) or not isinstance(made_by, dict) or "torchdeform" not in made_by:
+        return set()
+    return set(filter(is_result, names))
 
 
 def _require_own(files: PairFiles) -> None:

@@ -180,7 +180,7 @@ class AffineObjective:
         """Return S, −∞ without enough overlap, and the overlap: 1 when the smaller image lies wholly in the other."""
         grids = self.fixed.image.grid, self.moving.image.grid
         weights = [1.0 if m.weight is None else float(m.weight.mean()) for m in (self.fixed, self.moving)]
-        volume = torch.linalg.det(maps[:, :-1, :-1]).abs().clamp(min=1e-12)
+        volume = torch.linalg.det(maps[:, :-1, :-1]).abs()
         most = (weights[1] * grids[1].volume / grids[0].volume / volume).clamp(max=weights[0])
         overlap = weight.flatten(1).double().mean(1).cpu() / most
         return torch.where(overlap < self.min_overlap, -torch.inf, value.double().cpu()), overlap
