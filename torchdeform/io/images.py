@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import dicom, itk
+from torchdeform.io.dicom_header import may_be_dicom
 from torchdeform.io.files import atomic_folder, suffix
 from torchdeform.io.gate import DAMAGED
 from torchdeform.io.pictures import is_picture, picture_size, read_picture
@@ -86,7 +87,7 @@ def read_image(path: str | os.PathLike[str]) -> Image:
     if file.is_dir():
         return dicom.read_folder(file)
     require_sound(file)
-    if dicom.is_dicom(file):
+    if may_be_dicom(file):
         return dicom.read_file(file)
     if is_tiff(file):
         return read_tiff(file)
@@ -232,7 +233,7 @@ def image_size(path: Path) -> tuple[tuple[int, ...], int] | None:
 
 
 def _size(path: Path) -> tuple[tuple[int, ...], int] | None:
-    if path.is_dir() or dicom.is_dicom(path):
+    if path.is_dir() or may_be_dicom(path):
         return dicom.size(path)
     if is_tiff(path):
         return tiff_size(path)
