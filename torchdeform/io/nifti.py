@@ -12,7 +12,7 @@ from torchdeform.errors import InputError
 from torchdeform.io.files import suffix
 from torchdeform.io.gate import DAMAGED, require_beside, require_room
 from torchdeform.io.packed import Stream, opened
-from torchdeform.io.volume import NOT_FINITE, Volume, require_one
+from torchdeform.io.volume import NOT_FINITE, Volume, is_stack, require_one
 
 _CHUNK = 1 << 22  # bytes read at once
 _LONGEST_TAIL = 64_000_000  # bytes behind the pixels that are read, for the checksum at the end of a packed file
@@ -20,14 +20,14 @@ _LONGEST_TAIL = 64_000_000  # bytes behind the pixels that are read, for the che
 # Name, type and position of fields of the header, by the number that it starts with, which is its length.
 _FIELDS = {
     348: (
-        ("dim", "8i2", 40), ("datatype", "i2", 70), ("pixdim", "8f4", 76), ("offset", "f4", 108), ("slope", "f4", 112),
-        ("inter", "f4", 116), ("units", "u1", 123), ("qform", "i2", 252), ("sform", "i2", 254), ("quatern", "3f4", 256),
-        ("qoffset", "3f4", 268), ("rows", "(3,4)f4", 280), ("magic", "S4", 344),
+        ("dim", "8i2", 40), ("intent", "i2", 68), ("datatype", "i2", 70), ("pixdim", "8f4", 76), ("offset", "f4", 108),
+        ("slope", "f4", 112), ("inter", "f4", 116), ("units", "u1", 123), ("qform", "i2", 252), ("sform", "i2", 254),
+        ("quatern", "3f4", 256), ("qoffset", "3f4", 268), ("rows", "(3,4)f4", 280), ("magic", "S4", 344),
     ),
     540: (
         ("magic", "S4", 4), ("datatype", "i2", 12), ("dim", "8i8", 16), ("pixdim", "8f8", 104), ("offset", "i8", 168),
         ("slope", "f8", 176), ("inter", "f8", 184), ("qform", "i4", 344), ("sform", "i4", 348), ("quatern", "3f8", 352),
-        ("qoffset", "3f8", 376), ("rows", "(3,4)f8", 400), ("units", "i4", 500),
+        ("qoffset", "3f8", 376), ("rows", "(3,4)f8", 400), ("units", "i4", 500), ("intent", "i4", 504),
     ),
 }  # fmt: skip
 
@@ -51,11 +51,12 @@ _APART = 0.25  # of a voxel, by which qform and sform may differ in silence
 
 @dataclass(frozen=True)
 class _Header:
-    """The fields of a header by name, and the file of the pixels."""
+    """The fields of a header by name, the file of the pixels, and whether a fourth axis may hold vectors."""
 
     path: Path
     data: Path
     fields: Any
+    vectors: bool = False
 
     @property
     def size(self) -> tuple[int, ...]:
@@ -67,9 +68,15 @@ class _Header:
         return tuple(kept)
 
     @property
+    def stacked(self) -> bool:
+        """Whether the fourth axis holds the numbers of a pixel."""
+        return self.vectors and is_stack(self.size)
+
+    @property
     def vector(self) -> int:
-        """Numbers of a pixel on the fifth axis."""
-        return self.size[4] if len(self.size) == 5 and self.size[3] == 1 else 1
+        """Numbers of a pixel on the fifth axis, or on the fourth."""
+        fifth = self.size[4] if len(self.size) == 5 and self.size[3] == 1 else 1
+        return self.size[3] if self.stacked else fifth
 
     @property
     def space(self) -> tuple[int, ...]:
@@ -111,11 +118,12 @@ def nifti_files(path: Path) -> tuple[Path, ...]:
     return () if header.data == path else (header.data,)
 
 
-def read_nifti(path: Path) -> Volume:
+def read_nifti(path: Path, *, vectors: bool = False) -> Volume:
     """Read a NIfTI file.
 
     Args:
         path: the file, or the header of a pair.
+        vectors: whether a fourth axis that can hold vectors does.
 
     Raises:
         InputError: damaged, a series, complex numbers, pixels that are NaN or infinite, or a header without sense.
@@ -125,7 +133,7 @@ def read_nifti(path: Path) -> Volume:
         disagree. Without either it starts at 0 along the world's axes, as in ITK.
         Lengths become mm by the unit of the file; pixels are scaled as the header says.
     """
-    header = _read_header(path)
+    header = replace(_read_header(path), vectors=vectors)
     require_one(path, header.space)
     with opened(header.data, path) as file:
         values = _scaled(_pixels(file, header), header)
@@ -133,7 +141,8 @@ def read_nifti(path: Path) -> Volume:
         raise InputError(f"{path} {NOT_FINITE}")
     rows, remarks = _rows(header)
     volume = place(values, rows, path)
-    volume = _with_pixdim(replace(volume, remarks=remarks), header)
+    volume = replace(volume, remarks=remarks, intent=int(header.fields["intent"]), stacked=header.stacked)
+    volume = _with_pixdim(volume, header)
     return volume.in_units_of(*_UNITS.get(int(header.fields["units"]) & 7, (1.0, "mm")))
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from torchdeform.errors import InputError
 from torchdeform.io import dicom
+from torchdeform.io.dicom_header import is_dicom, may_be_dicom
 from torchdeform.io.files import is_tiff
 from torchdeform.io.gate import require_beside, require_file
 from torchdeform.io.tiff import tiff_parts
@@ -28,8 +29,8 @@ def files_of(path: Path) -> list[Path]:
     """
     require_file(path, "image file", folder=True)
     if path.is_dir():
-        return sorted(file for file in path.iterdir() if file.is_file() and dicom.is_dicom(file))
-    named = dicom.files if dicom.is_dicom(path) else tiff_parts if is_tiff(path) else volume_files
+        return sorted(file for file in path.iterdir() if file.is_file() and is_dicom(file))
+    named = dicom.files if may_be_dicom(path) else tiff_parts if is_tiff(path) else volume_files
     return sorted({path, *(file for file in _found(named, path) if _is_beside(file, path))})
 
 

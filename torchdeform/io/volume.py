@@ -33,6 +33,8 @@ class Volume:
         direction: world directions of the axes x, y, z as columns.
         unit: what its lengths are shown in, see `Image`.
         remarks: sentences about what the reader had to decide.
+        intent: NIfTI's code of what the numbers are, 0 for none.
+        stacked: whether the numbers of a pixel stand on the fourth axis of the file, as volumes of a series do.
     """
 
     values: NDArray[np.generic]
@@ -41,6 +43,8 @@ class Volume:
     direction: NDArray[np.float64]
     unit: str = "mm"
     remarks: tuple[str, ...] = ()
+    intent: int = 0
+    stacked: bool = False
 
     @property
     def size(self) -> tuple[int, ...]:
@@ -74,6 +78,11 @@ def squared(direction: NDArray[np.float64], name: str) -> NDArray[np.float64]:
         return direction
     left, _, right = np.linalg.svd(direction)
     return np.asarray(left @ right, np.float64)
+
+
+def is_stack(size: Sequence[int]) -> bool:
+    """Return whether the fourth axis can hold vectors: it has as many numbers as there are axes of space."""
+    return len(size) == 4 and size[3] == sum(n > 1 for n in size[:3])
 
 
 def require_one(path: Path, size: Sequence[int]) -> None:

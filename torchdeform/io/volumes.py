@@ -22,11 +22,12 @@ _TEXT_HEADERS: dict[str, tuple[Callable[[Path], Header], str]] = {
 _SIZES = {NIFTI: nifti_size, ANALYZE: nifti_size, MGH: mgh_size}
 
 
-def read_volume(path: Path) -> Volume:
+def read_volume(path: Path, *, vectors: bool = False) -> Volume:
     """Read NIfTI, MGH, MetaImage, NRRD, Analyze, or another format that ITK knows.
 
     Args:
         path: a regular file, see `require_file`; either of the two of a pair.
+        vectors: whether a fourth axis of D numbers holds vectors, instead of volumes of a series.
 
     Raises:
         InputError: damaged, of no known format, a series, or with a header that makes no sense.
@@ -37,18 +38,18 @@ def read_volume(path: Path) -> Volume:
     file = header_of_pair(path)
     kind = kind_of(file)
     if kind == NIFTI:
-        return read_nifti(file)
+        return read_nifti(file, vectors=vectors)
     if kind == MGH:
         return read_mgh(file)
     if kind == ANALYZE:
         nifti_size(file)
-        return isolated(read_by_itk, file, "NiftiImageIO", path=file)
+        return isolated(read_by_itk, file, "NiftiImageIO", vectors, path=file)
     if kind not in _TEXT_HEADERS:
-        return isolated(read_by_itk, file, path=file)
+        return isolated(read_by_itk, file, "", vectors, path=file)
     read_header, reader = _TEXT_HEADERS[kind]
     header = read_header(file)
     header.require_complete()
-    return isolated(read_by_itk, file, reader, path=file, size=header.stored).in_units_of(*header.unit)
+    return isolated(read_by_itk, file, reader, vectors, path=file, size=header.stored).in_units_of(*header.unit)
 
 
 def volume_size(path: Path) -> tuple[tuple[int, ...], int] | None:
