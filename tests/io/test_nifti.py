@@ -273,3 +273,13 @@ def test_pixels_need_no_offset(tmp_path):
     path = _save(tmp_path / "a.nii")
     expected = read_nifti(path).values
     np.testing.assert_array_equal(read_nifti(_changed(path, "<f", 108, 0.0)).values, expected)
+
+
+def test_vectors_on_the_fourth_axis(tmp_path):
+    vectors = np.random.default_rng(0).random((5, 6, 7, 3)).astype(np.float32)
+    path = _save(tmp_path / "a.nii", values=vectors, intent_code=1006)
+    found = read_nifti(path, vectors=True)
+    np.testing.assert_array_equal(found.values.swapaxes(0, 2), vectors)
+    assert (found.stacked, found.intent) == (True, 1006)
+    with pytest.raises(InputError, match="a series of 3 volumes"):
+        read_nifti(path)

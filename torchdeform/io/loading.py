@@ -1,5 +1,6 @@
 """Files read by ITK, without torch, so that a process of its own can do it."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -8,7 +9,7 @@ import numpy as np
 
 from torchdeform.errors import InputError
 from torchdeform.io.files import is_tiff, native_stderr
-from torchdeform.io.gate import DAMAGED
+from torchdeform.io.gate import DAMAGED, require_room
 from torchdeform.io.volume import Volume, is_stack, require_one
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ _DAMAGE_SAID = (
     "couldn't parse",
     "Success",
 )
+
+_TOO_LARGE = "is, by its header, larger than the memory here; if it is not, the header is damaged"
 
 _Result = TypeVar("_Result")
 
@@ -68,6 +71,8 @@ def read_by_itk(path: Path, reader: str = "", vectors: bool = False) -> Volume:
         return volume_of(load(path, reader, vectors))
     except RuntimeError as error:
         raise InputError(f"{path} {_fault(reason(error))}") from error
+    except MemoryError as error:
+        raise InputError(f"{path} {_TOO_LARGE}") from error
 
 
 def size_by_itk(path: Path) -> tuple[tuple[int, ...], int] | None:
@@ -103,10 +108,12 @@ def _execute(reader: "sitk.ImageFileReader", vectors: bool) -> "sitk.Image | Run
     """Read the reader's file, a series of one volume as that volume. ITK's error is returned, not raised."""
     try:
         reader.ReadImageInformation()
-        size = reader.GetSize()
+        path, size = Path(reader.GetFileName()), reader.GetSize()
+        if not reader.GetImageIO():  # else its header was checked before
+            require_room(path, math.prod(size) * reader.GetNumberOfComponents())
         if vectors and reader.GetNumberOfComponents() == 1 and is_stack(size):
             return reader.Execute()
-        require_one(Path(reader.GetFileName()), size)
+        require_one(path, size)
         reader.SetExtractSize([*size[:3], *[0] * len(size[3:])])
         return reader.Execute()
     except RuntimeError as error:
@@ -133,7 +140,7 @@ def _fault(said: str) -> str:
     if any(sign in said for sign in _DAMAGE_SAID):
         return DAMAGED
     if "llocate memory" in said or "bad_alloc" in said:
-        return "is, by its header, larger than the memory here; if it is not, the header is damaged"
+        return _TOO_LARGE
     if "determine ImageIO" in said:
         return "is no image of a known format; convert it to PNG, TIFF, NIfTI, MetaImage or NRRD"
     return f"cannot be read ({said}); export it again, or as another format"

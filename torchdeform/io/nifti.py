@@ -274,7 +274,7 @@ def _qform(header: _Header) -> NDArray[np.float64]:
 
 def _without_place(header: _Header) -> NDArray[np.float64]:
     lengths = np.abs(header.fields["pixdim"][1:4].astype(np.float64))
-    return np.column_stack([_LPS * np.diag(lengths), np.zeros(3, np.float64)])
+    return np.column_stack([np.diag(lengths * _LPS[:, 0]), np.zeros(3, np.float64)]).astype(np.float64)
 
 
 def place(values: NDArray[np.generic], rows: NDArray[np.float64], path: Path) -> Volume:

@@ -204,13 +204,13 @@ def _ordered(axes: str, values: NDArray[np.generic]) -> NDArray[np.generic]:
     return ordered.reshape(channels, -1, *ordered.shape[-2:])
 
 
-def _image(pixels: NDArray[np.generic], found: Scale, name: str, kind: np.dtype[Any]) -> Image:
+def _image(pixels: NDArray[np.generic], found: Scale, name: str, held: np.dtype[Any]) -> Image:
     """Return pixels ``(C, Z, Y, X)`` as an image without axes of one sample."""
     used = [k for k in range(3) if pixels.shape[k + 1] > 1]
     if len(used) < 2:
         raise InputError(f"{name} has size {list(pixels.shape[1:])}; give an image with at least two axes")
     (spacing, unit), shape = found, tuple(pixels.shape[k + 1] for k in used)
-    data = torch.from_numpy(np.ascontiguousarray(pixels, dtype=kind).reshape(1, -1, *shape))
+    data = torch.from_numpy(np.ascontiguousarray(pixels, dtype=held).reshape(1, -1, *shape))
     kind = "uint8" if pixels.dtype.kind == "b" else pixels.dtype.name
     return Image(data, Grid(shape, tuple(spacing[k] for k in used)), name=name, pixel_type=kind, unit=unit)
 

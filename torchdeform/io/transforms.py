@@ -89,7 +89,7 @@ def _require_displacements(volume: Volume, path: Path) -> None:
     """Raise `InputError` if vectors are rather the positions that nodes go to, in LPS or RAS, than displacements."""
     index = np.stack(np.meshgrid(*map(np.arange, volume.size), indexing="ij"), axis=-1) * volume.spacing
     places = index @ volume.direction.T + volume.origin
-    values = volume.values.swapaxes(0, -2)[..., :2]
+    values = volume.values.swapaxes(0, -2)[..., :2].astype(np.float64)
     for positions in (places[..., :2], -places[..., :2]):
         if np.std(values - positions) < _POSITIONS * np.std(positions):
             raise InputError(f"{path} holds positions, not displacements; subtract from each voxel its place in LPS mm")
