@@ -15,14 +15,14 @@ from torchdeform.io.gate import DAMAGED
 
 Stream = BinaryIO | gzip.GzipFile
 
-_MAGIC = b"\x1f\x8b"
+MAGIC = b"\x1f\x8b"
 _CHUNK = 1 << 22  # bytes read at once
 _FULL = 1 / 4  # share of what is free on a disk, or of memory, that a file may take unpacked
 
 
 def is_packed(path: Path) -> bool:
     """Return whether a file is compressed with gzip."""
-    return read_head(path, len(_MAGIC)) == _MAGIC
+    return read_head(path, len(MAGIC)) == MAGIC
 
 
 @contextmanager
