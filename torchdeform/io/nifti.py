@@ -234,6 +234,8 @@ def _rows(header: _Header) -> tuple[NDArray[np.float64], tuple[str, ...]]:
             qform = _qform(header)
         except InputError:  # the sform is what counts
             return sform, ()
+    if qform is not None and not _spans(sform, header.space):
+        return qform, (f"{header.path} has an sform without sense; the qform is used: correct its header",)
     apart = 0.0 if qform is None else _apart(sform, qform, header)
     if not apart > _APART:
         return sform, ()
@@ -242,6 +244,15 @@ def _rows(header: _Header) -> tuple[NDArray[np.float64], tuple[str, ...]]:
         "as in nibabel, FSL and SPM, and tools of ITK may use the qform: correct its header"
     )
     return sform, (text,)
+
+
+def _spans(rows: NDArray[np.float64], size: tuple[int, ...]) -> bool:
+    """Return whether an affine gives every axis of several samples a direction of its own."""
+    columns = rows[:, [k for k, n in enumerate(size[:3]) if n > 1]]
+    with np.errstate(all="ignore"):
+        units = columns / np.linalg.norm(columns, axis=0)
+    finite = bool(np.isfinite(rows).all() and np.isfinite(units).all())
+    return finite and np.linalg.matrix_rank(units, 1e-3) == units.shape[1]
 
 
 def _apart(one: NDArray[np.float64], other: NDArray[np.float64], header: _Header) -> float:

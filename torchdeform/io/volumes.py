@@ -3,10 +3,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from torchdeform.errors import InputError
 from torchdeform.io.files import suffix
 from torchdeform.io.headers import Header
 from torchdeform.io.isolated import isolated
-from torchdeform.io.kinds import ANALYZE, META, MGH, NIFTI, NRRD, kind_of
+from torchdeform.io.kinds import ANALYZE, META, MGH, NIFTI, NRRD, kind_of, known_otherwise
 from torchdeform.io.loading import read_by_itk, size_by_itk
 from torchdeform.io.metaimage import metaimage_header
 from torchdeform.io.mgh import mgh_size, read_mgh
@@ -19,6 +20,7 @@ _TEXT_HEADERS: dict[str, tuple[Callable[[Path], Header], str]] = {
     META: (metaimage_header, "MetaImageIO"),
     NRRD: (nrrd_header, "NrrdImageIO"),
 }
+_PIXELS = (".raw", ".zraw", ".raw.gz", ".img", ".img.gz")
 _SIZES = {NIFTI: nifti_size, ANALYZE: nifti_size, MGH: mgh_size}
 
 
@@ -45,6 +47,7 @@ def read_volume(path: Path, *, vectors: bool = False) -> Volume:
         nifti_size(file)
         return isolated(read_by_itk, file, "NiftiImageIO", vectors, path=file)
     if kind not in _TEXT_HEADERS:
+        _require_image(file)
         return isolated(read_by_itk, file, "", vectors, path=file)
     read_header, reader = _TEXT_HEADERS[kind]
     header = read_header(file)
@@ -91,3 +94,16 @@ def header_of_pair(path: Path) -> Path:
             if header.is_file():
                 return header
     return path
+
+
+def _require_image(path: Path) -> None:
+    """Raise `InputError` for a file that is certainly something else, or pixels without their header."""
+    if found := known_otherwise(path):
+        raise InputError(f"{path} {found}")
+    if suffix(path) not in _PIXELS:
+        return
+    name = path.name.removesuffix(suffix(path))
+    for ending in (".mhd", ".nhdr", ".hdr"):
+        if path.with_name(name + ending).is_file():
+            raise InputError(f"{path} holds pixels only; give its header, {name}{ending}")
+    raise InputError(f"{path} holds pixels only; put its header (.mhd, .nhdr or .hdr) beside it and give that")
