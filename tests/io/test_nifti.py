@@ -247,7 +247,7 @@ def test_labels_keep_every_value(tmp_path, kind):
 WRONG: dict[str, tuple[Callable[[Path], Path], str]] = {
     "quaternion": (lambda p: _changed(_save(p, codes=(1, 0)), "<3f", 256, 2, 0, 0), "a qform that is no rotation"),
     "NaN in the qform": (lambda p: _changed(_save(p, codes=(1, 0)), "<f", 256, np.nan), "a qform that is no rotation"),
-    "NaN in the sform": (lambda p: _changed(_save(p, codes=(0, 1)), "<f", 280, np.nan), "NaN or infinite numbers in its"),
+    "NaN in the sform": (lambda p: _changed(_save(p, codes=(0, 1)), "<f", 280, np.nan), "NaN or infinite numbers"),
     "flat sform": (lambda p: _changed(_save(p, codes=(0, 1)), "<12f", 280, *[0.0] * 12), "affine that is singular"),
     "intercept": (lambda p: _changed(_save(p), "<2f", 112, 2, np.nan), "the intercept nan"),
     "type": (lambda p: _changed(_save(p), "<h", 70, 1), "pixels of the type 1, which is unknown"),

@@ -12,12 +12,8 @@ from torch import Tensor
 from torchdeform.core.grid import Grid, slabs
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.io import loading
 from torchdeform.io.files import atomic_folder, native_stderr
-from torchdeform.io.loading import load as load
-from torchdeform.io.loading import no_warnings
-from torchdeform.io.loading import quietly as quietly
-from torchdeform.io.loading import reason as reason
+from torchdeform.io.loading import no_warnings, reason, volume_of
 from torchdeform.io.volume import Volume, held_type, squared
 
 if TYPE_CHECKING:
@@ -42,7 +38,7 @@ def save(image: "sitk.Image", path: Path) -> None:
 
 def to_image(itk: "sitk.Image", name: str) -> Image:
     """Return a SimpleITK image as `volume_image` does."""
-    return volume_image(loading.volume_of(itk), name)
+    return volume_image(volume_of(itk), name)
 
 
 def volume_image(volume: Volume, name: str, *, exact: bool = False) -> Image:

@@ -18,6 +18,7 @@ from torchdeform.errors import InputError
 from torchdeform.io import elastix, itk, itk_maps, matrices
 from torchdeform.io.files import atomic_folder, native_stderr, read_head, require_space, suffix
 from torchdeform.io.gate import require_file
+from torchdeform.io.loading import reason
 from torchdeform.io.maps import Field, Linear, Spline
 from torchdeform.io.volume import Volume
 from torchdeform.io.volumes import read_volume
@@ -296,7 +297,7 @@ def _save(transform: "sitk.Transform", path: Path) -> None:
             with native_stderr():
                 sitk.WriteTransform(transform, str(folder / path.name))
         except RuntimeError as error:
-            raise InputError(f"{path} cannot be written: {itk.reason(error)}; use the ending .h5") from error
+            raise InputError(f"{path} cannot be written: {reason(error)}; use the ending .h5") from error
 
 
 def _check_field(u: Tensor, fixed: Image, name: str) -> None:
