@@ -131,12 +131,15 @@ def _normalise(start: Sequence[Tensor | float], moved: Tensor, grid: Grid) -> Te
     return box
 
 
-def inside_box(points: Tensor, grid: Grid) -> Tensor:
-    """Return ``(B, 1, *T)``, True where the nearest node, were the grid continued, belongs to the grid (as in ITK)."""
+def inside_box(points: Tensor, grid: Grid, margin: float = 0.5) -> Tensor:
+    """Return ``(B, 1, *T)``, True in the box of the nodes and up to ``margin`` voxels around it.
+
+    With half a voxel, as in ITK, the nearest node, were the grid continued, belongs to the grid.
+    """
     inside = torch.ones((), dtype=torch.bool, device=points.device)
     for k, (n, h) in enumerate(zip(grid.shape, grid.spacing, strict=True)):
         index = points[:, k : k + 1] / h
-        inside = inside & (index >= -0.5) & (index < n - 0.5)
+        inside = inside & (index >= -margin) & (index < n - 1 + margin)
     return inside
 
 

@@ -159,7 +159,8 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
     if labels[0] is not None and labels[1] is not None:  # some must be the same, or nothing can be measured
         first = resample(labels[0], fixed, mode="nearest")
         common_labels(first, labels[1].data, names=(labels[0].name, labels[1].name))
-    return Inputs(fixed, moving, annotations, report.of(WARNING))
+    remarks = [text for image in labels if image is not None for text in image.remarks]
+    return Inputs(fixed, moving, annotations, (*report.of(WARNING), *remarks))
 
 
 def _read_points(files: PairFiles, fixed: Image, moving: Image) -> dict[str, Tensor]:
