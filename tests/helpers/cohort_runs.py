@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import subprocess
 import sys
 import time
@@ -105,4 +106,26 @@ def faults(cohort: Path, names: str, right: bytes | None = None) -> list[str]:
         found.append("summary")
     if list(cohort.parent.rglob(".torchdeform-*")):
         found.append("left behind")
+    return found
+
+
+def living(cohort: Path, seconds: float) -> list[int]:
+    """Return the processes that still have a file in the cohort's folder open, or work on it, after some seconds."""
+    end = time.monotonic() + seconds
+    while (found := _users(cohort.parent)) and time.monotonic() < end:
+        time.sleep(0.1)
+    return found
+
+
+def _users(folder: Path) -> list[int]:
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        if int(place.name) == os.getpid():
+            continue
+        try:
+            links = [os.readlink(link) for link in (place / "fd").iterdir()]  # noqa: PTH115 - names may be of no file
+        except OSError:
+            continue
+        if any(link.startswith(str(folder)) for link in links):
+            found.append(int(place.name))
     return found

@@ -89,13 +89,15 @@ def _scheduler(value: object, info: ValidationInfo) -> object:
     return str(place(value, info)) if text.endswith(".json") else text
 
 
+_LONGEST = 1e8  # s, three years: timers of the system take no more than 49 days on some, 292 years on others
+
 _written = PlainSerializer(lambda value: str(value).replace("$", "$$"), return_type=str, when_used="json")
 
 Place = Annotated[Path, BeforeValidator(place), _written]
 Pattern = Annotated[str, BeforeValidator(pattern), _written]
 Size = Annotated[int, BeforeValidator(_size), Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
-Seconds = Annotated[float, Field(gt=0)]
+Seconds = Annotated[float, Field(gt=0, le=_LONGEST, allow_inf_nan=False)]
 Scheduler = Annotated[str, BeforeValidator(_scheduler)]
 
 
@@ -179,7 +181,7 @@ class TemplateSettings(Strict):
     """Scale all images to one mean and one standard deviation before they are averaged."""
     corrections: Count = AveragingSettings.corrections
     """Corrections in a round at most that bring the mean of the maps from the template to the identity."""
-    tolerance: Annotated[float, Field(ge=0)] = AveragingSettings.tolerance
+    tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = AveragingSettings.tolerance
     """Largest displacement of that mean, in voxels, that counts as the identity."""
 
     @property
