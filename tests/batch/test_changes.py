@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from cohort_runs import done, faults, finish, journal, start, summary, wait_for, write_cohort
+from cohort_runs import done, faults, finish, journal, start, summary, write_cohort
 
 from torchdeform.cli.main import torchdeform
 from torchdeform.cohort.task import Task
@@ -122,15 +122,15 @@ def test_only_results_are_removed(cohort, feigned):
     assert [path.name for path in (out / "a").iterdir()] == ["thesis.docx"]
 
 
-def test_two_runs_at_once_are_refused_and_the_first_goes_on(cohort):
-    process = start(cohort)
-    wait_for(cohort, 1, process)
-    code, _, said = finish(cohort)
+def test_two_runs_at_once_are_refused_and_the_first_goes_on(cohort, feigned):
+    said: list[tuple[int, str, str]] = []
+    feigned["b"] = lambda _: said.append(finish(cohort))
+    assert run(cohort) == 0
+    ((code, _, errors),) = said
     assert code == 2
-    assert "another run is working in" in said
-    _, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
-    assert faults(cohort, "abcd") == []
+    assert "another run is working in" in errors
+    assert sorted(done(cohort)) == list("abcd")
+    assert summary(cohort) == dict.fromkeys("abcd", "done")
 
 
 def test_nobody_needs_to_read_what_is_said(cohort):
