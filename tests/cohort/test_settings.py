@@ -19,8 +19,8 @@ from torchdeform.cohort.settings import EngineSettings, expand
         ({"workers": 0}, "greater than or equal to 1"),
         ({"timeout": 0}, "greater than 0"),
         ({"timeout": -1}, "greater than 0"),
-        ({"timeout": float("inf")}, "finite number"),
-        ({"timeout": float("nan")}, "finite number"),
+        ({"timeout": float("inf")}, "less than or equal to"),
+        ({"timeout": float("nan")}, "less than or equal to"),
         ({"timeout": 1e300}, "less than or equal to"),
     ],
 )

@@ -1,6 +1,5 @@
 """Learn2Reg: the pairs in the JSON of a data set, and the names of displacement fields in a submission."""
 
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 from torchdeform.cohort.names import PairSpec, pair_name
 from torchdeform.cohort.schema import Learn2Reg
 from torchdeform.errors import InputError
+from torchdeform.io.texts import read_json
 
 _PAIRS = {"train": "training_paired_images", "val": "registration_val", "test": "registration_test"}
 _LISTS = ("training", "test")
@@ -62,12 +62,7 @@ def submission_names(fixed: Path, moving: Path) -> tuple[str, ...]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; check the name of the data set's JSON") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is no valid JSON: {error}; give the data set's NAME_dataset.json") from error
+    content = read_json(path, "NAME_dataset.json of a data set")
     if not isinstance(content, dict):
         raise InputError(f"{path} describes no data set; give its NAME_dataset.json")
     return content

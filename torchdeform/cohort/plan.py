@@ -16,7 +16,7 @@ from torchdeform.cohort.schema import Cohort
 from torchdeform.errors import InputError, nearest_name
 from torchdeform.io import read_displacement, read_image
 from torchdeform.io.files import atomic_folder
-from torchdeform.io.gate import require_file, require_name
+from torchdeform.io.gate import read_text, require_file, require_name
 from torchdeform.io.transforms import write_voxel_displacement
 from torchdeform.pipeline.register import Outcome, PairFiles, register_files
 from torchdeform.registration.result import Callback
@@ -259,6 +259,6 @@ def _with_titles(files: PairFiles) -> PairFiles:
     given = {key: path for key, path in files.given().items() if key in _POINTS}
     with atomic_folder(files.out) as folder:
         for key, path in given.items():
-            rows = path.read_text(encoding="utf-8-sig")
+            rows = read_text(path, "file of landmarks", legacy=True)
             (folder / f"{key}.csv").write_text(f"i,j,k\n{rows}", encoding="utf-8")
     return replace(files, **{key: files.out / f"{key}.csv" for key in given})

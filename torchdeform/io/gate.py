@@ -36,9 +36,9 @@ def require_file(path: Path, what: str = "file", *, folder: bool = False) -> Non
     mode = _mode(path, what)
     if stat.S_ISDIR(mode):
         if not folder:
-            raise InputError(f"{path} is a folder; give {_article(what)}")
+            raise InputError(f"{path} is a folder; give {article(what)}")
     elif not stat.S_ISREG(mode):
-        raise InputError(f"{path} is no file but a device or a pipe; give {_article(what)}")
+        raise InputError(f"{path} is no file but a device or a pipe; give {article(what)}")
     try:
         if stat.S_ISDIR(mode):
             os.scandir(path).close()
@@ -81,7 +81,8 @@ def require_name(path: Path, what: str = "file") -> None:
         raise InputError(f"{shown!r} is a name that other programs cannot read; rename the {what}")
 
 
-def _article(what: str) -> str:
+def article(what: str) -> str:
+    """Return ``a file`` or ``an image``."""
     return f"{'an' if what[0] in 'aeiou' else 'a'} {what}"
 
 
@@ -101,15 +102,15 @@ def read_text(path: Path, what: str = "text file", *, legacy: bool = False) -> s
         content = file.read(LONGEST_TEXT + 1)
     if len(content) > LONGEST_TEXT:
         raise InputError(
-            f"{path} is larger than {readable(LONGEST_TEXT)}, too large for {_article(what)}; check the name"
+            f"{path} is larger than {readable(LONGEST_TEXT)}, too large for {article(what)}; check the name"
         )
     coding = next((name for mark, name in _MARKS.items() if content.startswith(mark)), "utf-8")
     try:
         text = _decode(content, coding, legacy)
     except UnicodeError as error:
-        raise InputError(f"{path} is no text; give {_article(what)} in UTF-8") from error
+        raise InputError(f"{path} is no text; give {article(what)} in UTF-8") from error
     if "\0" in text:
-        raise InputError(f"{path} is no text, it has zero bytes; give {_article(what)} in UTF-8")
+        raise InputError(f"{path} is no text, it has zero bytes; give {article(what)} in UTF-8")
     return text
 
 

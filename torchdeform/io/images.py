@@ -54,7 +54,7 @@ _SLIDES = (".svs", ".ndpi", ".scn", ".bif", ".qptiff", ".lsm", ".btf", ".tf8")
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:
-    """Read a 2D or 3D image: DICOM, NIfTI, MGH, MetaImage, NRRD, PNG, JPEG, TIFF, BMP and other formats of ITK.
+    """Read a 2D or 3D image: DICOM, NIfTI, MGH, MetaImage, NRRD, PNG, JPEG, TIFF, slides and other formats of ITK.
 
     Args:
         path: the file, plain or compressed with gzip; a folder with one DICOM series; or one file of a series. What
@@ -72,7 +72,8 @@ def read_image(path: str | os.PathLike[str]) -> Image:
         An axis with one sample is dropped, so a volume of one slice is a 2D image. It keeps its position if it is at a
         right angle to the dropped world axis; an oblique slice gets the coordinates of its own plane.
         One DICOM file is read as its whole series if that is a volume of 8 slices or more, see `dicom.read_file`.
-        The pages of a TIFF are a volume.
+        TIFF and pictures are known by content, whatever their name, and turned and coloured as a viewer shows them. The
+        pages of a TIFF are a volume. The dots per inch of a print are no scale, see `tiff_scale.scale`.
     """
     return _read(Path(path))
 
@@ -121,7 +122,7 @@ def write_image(image: Image, path: str | os.PathLike[str]) -> None:
         InputError: unknown ending, pixels that the format cannot hold, or a folder that cannot be written.
 
     Notes:
-        The file appears complete or not at all.
+        The file appears complete or not at all. JPEG and BMP keep no spacing.
     """
     file = Path(path)
     pixels = _stored(image, file)

@@ -17,7 +17,9 @@ T = TypeVar("T")
 _SECONDS, _PER_BYTE = 30.0, 1e-6  # that a reader may take, and more for each byte of the file
 
 
-def isolated(function: Callable[..., T], *arguments: object, path: Path, size: int | None = None) -> T:
+def isolated(
+    function: Callable[..., T], *arguments: object, path: Path, size: int | None = None, seconds: float | None = None
+) -> T:
     """Return ``function(*arguments)``, called in a process of its own that may crash or hang.
 
     Args:
@@ -25,6 +27,7 @@ def isolated(function: Callable[..., T], *arguments: object, path: Path, size: i
         arguments: of the function; they and the answer must allow pickling.
         path: the file that is read, for the sentence.
         size: bytes that are read; by default those of ``path``.
+        seconds: that it may take, 30 by default, and 1 more for each megabyte.
 
     Raises:
         InputError: the process died or took too long.
@@ -34,7 +37,7 @@ def isolated(function: Callable[..., T], *arguments: object, path: Path, size: i
         The process starts with the first call (0.3 s), is kept for the next, and ends with this one. It gets no more
         memory than is free.
     """
-    seconds = _SECONDS + _PER_BYTE * (path.stat().st_size if size is None else size)
+    seconds = (_SECONDS if seconds is None else seconds) + _PER_BYTE * (path.stat().st_size if size is None else size)
     try:
         return _worker(os.getpid()).call(_limited, Path.cwd(), available(), function, arguments, timeout=seconds)
     except WorkerLost as error:
