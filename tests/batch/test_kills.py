@@ -11,7 +11,7 @@ NAMES = "abcdef"
 
 
 def _engines() -> list[object]:
-    return [pytest.param(name, marks=[] if name == "local" else pytest.mark.slow) for name in ENGINES]
+    return [pytest.param(name, marks=[] if name == "local" else pytest.mark.slow) for name in ENGINES if name != "one"]
 
 
 @pytest.mark.parametrize("engine", _engines())
