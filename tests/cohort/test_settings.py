@@ -18,6 +18,10 @@ from torchdeform.cohort.settings import EngineSettings, expand
         ({"kind": "dask", "cluster": {"kind": "slurm", "workers": 4, "cores": 8, "gpus": 2}}, "takes a GPU"),
         ({"workers": 0}, "greater than or equal to 1"),
         ({"timeout": 0}, "greater than 0"),
+        ({"timeout": -1}, "greater than 0"),
+        ({"timeout": float("inf")}, "less than or equal to"),
+        ({"timeout": float("nan")}, "less than or equal to"),
+        ({"timeout": 1e300}, "less than or equal to"),
     ],
 )
 def test_settings_that_contradict_are_refused(settings, sentence):

@@ -20,7 +20,7 @@ from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
 from torchdeform.io.files import stem
 from torchdeform.metrics.similarity import needs_common_scale
-from torchdeform.pipeline.memory import footprint
+from torchdeform.pipeline.memory import advice, footprint
 from torchdeform.registration.settings import RegistrationSettings
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
@@ -267,12 +267,13 @@ def _check_orientation(fixed: Image, moving: Image) -> Iterator[Finding]:
 
 def _check_memory(fixed: Image, settings: RegistrationSettings) -> Iterator[Finding]:
     room = available(fixed.data.device)
-    need = footprint(fixed.grid, fixed.data.shape[1], settings)
+    channels = fixed.data.shape[1]
+    need = footprint(fixed.grid, channels, settings)
     if room is None or need < 0.8 * room:
         return
     text = (
         f"registration at {fixed.grid.size_text} takes about {readable(need)} of memory and {readable(room)} are free; "
-        f"give --memory {readable(room, spaced=False)} to stop at a coarser level, or crop {fixed.name}"
+        f"{advice(fixed.grid, room, channels, settings)}, or crop {fixed.name}"
     )
     yield Finding(ERROR if need > 1.25 * room else WARNING, text)
 

@@ -21,7 +21,7 @@ from torchdeform.io.images import ending_like, read_labels, read_optional, requi
 from torchdeform.io.points import matched, read_points
 from torchdeform.io.texts import read_json
 from torchdeform.metrics.evaluation import common_labels
-from torchdeform.pipeline.memory import fitting_grid, footprint
+from torchdeform.pipeline.memory import advice, fitting_grid, footprint
 from torchdeform.pipeline.preflight import WARNING, preflight
 from torchdeform.registration.deformable import resample_result
 from torchdeform.registration.problem import Annotations
@@ -243,7 +243,7 @@ def _fit_to_memory(
         if free is not None and need > free:
             raise InputError(
                 f"{fixed.name}: registering it takes about {readable(need)} of memory and {readable(free)} are free; "
-                f"use --memory {readable(free, spaced=False)} to register it on a coarser grid"
+                f"{advice(fixed.grid, free, channels, settings)}"
             )
         return fixed, ()
     grid = fitting_grid(fixed.grid, memory, channels, settings)
