@@ -17,6 +17,7 @@ from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.io import read_image, write_displacement, write_image, write_transform
 from torchdeform.io.files import atomic_folder, require_writable
 from torchdeform.io.images import ending_like, read_labels, read_optional, require_storable, write_labels
+from torchdeform.io.point_tables import FIXED, MOVING
 from torchdeform.io.points import matched, read_points
 from torchdeform.io.texts import read_json
 from torchdeform.metrics.evaluation import common_labels
@@ -161,7 +162,9 @@ def _read_points(files: PairFiles, fixed: Image, moving: Image) -> dict[str, Ten
     """Return corresponding landmarks in the world, ``(1, D, n)`` each, by the names that `Annotations` has for them."""
     if files.fixed_points is None or files.moving_points is None:
         return {}
-    first, second, _ = matched(read_points(files.fixed_points, fixed), read_points(files.moving_points, moving))
+    first, second, _ = matched(
+        read_points(files.fixed_points, fixed, side=FIXED), read_points(files.moving_points, moving, side=MOVING)
+    )
     return {"fixed_points": first.T.unsqueeze(0), "moving_points": second.T.unsqueeze(0)}
 
 
