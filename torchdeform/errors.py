@@ -1,9 +1,19 @@
 """Typed errors: one sentence that says what is wrong, where, and what to do about it."""
 
 import difflib
+import errno
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
+
+# What a disk answers that is full, read-only, broken or gone, and a system that has no more open files to give.
+_OF_MACHINE = {
+    number
+    for name in (
+        "ENOSPC", "EDQUOT", "EROFS", "EIO", "ESTALE", "EFBIG", "EMFILE", "ENFILE", "ENOTCONN", "EREMOTEIO", "ETIMEDOUT",
+    )
+    if (number := getattr(errno, name, None)) is not None
+}  # fmt: skip
 
 # Set in the environment: the shell shows the traceback of an error.
 TRACEBACK = "TORCHDEFORM_TRACEBACK"
@@ -21,6 +31,19 @@ class InputError(TorchdeformError, ValueError):
 
 class ComputationError(TorchdeformError, RuntimeError):
     """The input was fine, the computation failed (exit code 1 at the shell)."""
+
+
+class MachineError(ComputationError):
+    """The machine failed, such as a disk that is full or gone: nothing is settled, the same command goes on later."""
+
+
+def of_machine(error: BaseException | None) -> OSError | MachineError | None:
+    """Return the failure of the machine that an error is or comes from, None if there is none."""
+    while error is not None:
+        if isinstance(error, MachineError) or (isinstance(error, OSError) and error.errno in _OF_MACHINE):
+            return error
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+    return None
 
 
 def shown(value: object) -> str:
@@ -79,6 +102,11 @@ def require_ranges(settings: object, prefix: str, **ranges: str | Range) -> None
 
 def explain(error: Exception) -> tuple[str, int]:
     """Return what to tell a person about an error, and the exit code."""
+    machine = of_machine(error)
+    if isinstance(machine, OSError):
+        where = machine.filename or "the disk"
+        return f"{where}: {machine.strerror}; mend that, or make room, and run the same command again", 1
+    error = machine or error
     if isinstance(error, InputError):
         return str(error), 2
     if isinstance(error, ComputationError):

@@ -161,7 +161,7 @@ def test_damaged_files_are_refused_quietly(tmp_path, capfd, ending, share):
     [
         ("no.png", lambda p: None, "does not exist"),
         ("folder.png", lambda p: p.mkdir(), "is a folder"),
-        ("text.png", lambda p: p.write_text("hello"), "cannot be read as an image"),
+        ("text.png", lambda p: p.write_text("hello"), "no image of a known format"),
         ("text.txt", lambda p: p.write_text("hello"), "no image of a known format"),
         ("series.nii.gz", lambda p: sitk.WriteImage(_itk(np.zeros((3, 4, 5, 6))), str(p)), "is a series"),
         ("line.mha", lambda p: sitk.WriteImage(_itk(np.zeros((1, 1, 6))), str(p)), "at least two axes"),
@@ -260,15 +260,17 @@ def test_a_mask_that_is_not_there_is_an_error(folder, name):
         (".png", 1.0, "px"),
         (".png", 0.5, "mm"),
         (".jpg", 1.0, "px"),
+        (".jpg", 0.5, "px"),
         (".bmp", 1.0, "px"),
-        (".tif", 1.0, "px"),
+        (".bmp", 0.5, "px"),
+        (".tif", 1.0, "mm"),
         (".tif", 0.5, "mm"),
         (".nii.gz", 1.0, "mm"),
         (".mha", 1.0, "mm"),
     ],
 )
 def test_files_without_a_spacing_count_in_pixels(tmp_path, ending, spacing, unit):
-    """ITK itself gives 1 mm to what has no spacing."""
+    """JPEG and BMP keep no scale: their dots per inch are those of a print."""
     image = Image(torch.zeros(1, 1, 12, 15), Grid((12, 15), (spacing, spacing)), pixel_type="uint8")
     write_image(image, tmp_path / f"a{ending}")
     assert read_image(tmp_path / f"a{ending}").unit == unit

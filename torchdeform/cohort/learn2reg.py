@@ -33,15 +33,20 @@ def learn2reg_pairs(source: Learn2Reg) -> list[PairSpec]:
     return [_pair_spec(pair, images, source.file, f"{key}[{n}]") for n, pair in enumerate(pairs)]
 
 
-def submission_name(fixed: Path, moving: Path) -> str:
-    """Return ``disp_0001_0002.nii.gz``, the name that the evaluation of the challenge expects.
+def submission_names(fixed: Path, moving: Path) -> tuple[str, ...]:
+    """Return the names that evaluations of the challenge look for, the best known one first.
 
     Args:
         fixed: image named ``..._CASE_MODALITY.nii.gz``, four digits each.
-        moving: likewise. The name contains the modalities unless they are equal, or 0000 and 0001.
+        moving: likewise.
 
     Raises:
         InputError: another name.
+
+    Notes:
+        The evaluation of 2025-02-10 looks for ``disp_0001_0002.nii.gz`` where the modalities are 0000 and 0001, and
+        for ``disp_0001_0000_0002_0000.nii.gz`` elsewhere; older copies look for the short name where both modalities
+        are the same. Wherever one of them may look for the short name there are both.
     """
     cases = []
     for path in (fixed, moving):
@@ -50,9 +55,10 @@ def submission_name(fixed: Path, moving: Path) -> str:
             raise InputError(f"{path.name} must end in _CASE_MODALITY.nii.gz, four digits each, for a submission")
         cases.append((found[1], found[2]))
     (one, other), modalities = (case[0] for case in cases), tuple(case[1] for case in cases)
+    whole = f"disp_{one}_{modalities[0]}_{other}_{modalities[1]}.nii.gz"
     if modalities[0] == modalities[1] or modalities == ("0000", "0001"):
-        return f"disp_{one}_{other}.nii.gz"
-    return f"disp_{one}_{modalities[0]}_{other}_{modalities[1]}.nii.gz"
+        return f"disp_{one}_{other}.nii.gz", whole
+    return (whole,)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -1,8 +1,12 @@
 """The gate of every path from outside: what may be opened, how much of it is read, how much memory it may take."""
 
 import codecs
+import errno
 import os
 import stat
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from torchdeform.core.memory import available, readable
@@ -10,9 +14,11 @@ from torchdeform.errors import InputError, nearest_name
 
 DAMAGED = "is damaged or incomplete; fetch or export it again"
 EMPTY = "is empty; fetch or export it again"
+CROP = "crop it, or use a machine with more"
 
 LONGEST_TEXT = 16_000_000  # bytes of a text: settings, tables, landmarks, transforms
 _SMALL, _DENSEST = 64_000_000, 1100  # bytes that any file may announce; and per byte of a larger one
+_MACHINE = {errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 _MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 
 
@@ -117,19 +123,28 @@ def _decode(content: bytes, coding: str, legacy: bool) -> str:
         return content.decode("cp1252")
 
 
-def require_room(path: Path, needed: int) -> None:
+def require_room(
+    path: Path, needed: int, *, stored: int | None = None, held: int | None = None, remedy: str = CROP
+) -> None:
     """Raise `InputError` unless the ``needed`` bytes that the header of ``path`` announces can be there and fit.
+
+    Args:
+        path: the file of the header.
+        needed: bytes of its pixels.
+        stored: bytes of the files that hold them; those of ``path`` by default.
+        held: bytes that reading takes, with what the pixels become; ``needed`` by default.
+        remedy: what to do where they are too many.
 
     Notes:
         Nothing that deflate packed becomes more than 1032 times as long, and other packings of pixels stay below.
     """
-    if needed > max(_SMALL, _DENSEST * path.stat().st_size):
+    stored = path.stat().st_size if stored is None else stored
+    if needed > max(_SMALL, _DENSEST * stored):
         raise InputError(f"{path} announces {readable(needed)} of pixels, far more than it can hold; it {DAMAGED}")
-    free = available()
-    if free is not None and needed > free:
+    free, held = available(), needed if held is None else held
+    if free is not None and held > free:
         raise InputError(
-            f"{path} takes, by its header, {readable(needed)} of memory and {readable(free)} are free; "
-            "crop it, or use a machine with more"
+            f"{path} takes, by its header, {readable(held)} of memory and {readable(free)} are free; {remedy}"
         )
 
 
@@ -139,3 +154,29 @@ def require_beside(data: Path, header: Path) -> None:
     if not data.resolve().is_relative_to(home):
         raise InputError(f"{header} keeps its pixels in {data}, which is not beside it; put both into one folder")
     require_file(data, "file of pixels")
+
+
+@contextmanager
+def reading(path: Path, fault: str = DAMAGED) -> Iterator[None]:
+    """Say in one sentence that a library failed at the content of a file, with whatever it raises; drop its warnings.
+
+    Args:
+        path: the file.
+        fault: what is said about it.
+
+    Raises:
+        InputError: instead of any error inside the block.
+        OSError: the machine failed, not the file.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except InputError:
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno in _MACHINE:
+            raise
+        if isinstance(error, MemoryError):
+            raise InputError(f"{path} takes more memory than there is here; {CROP}") from error
+        raise InputError(f"{path} {fault}") from error

@@ -39,7 +39,7 @@ def isolated(
     """
     seconds = (_SECONDS if seconds is None else seconds) + _PER_BYTE * (path.stat().st_size if size is None else size)
     try:
-        return _worker(os.getpid()).call(_limited, available(), function, arguments, timeout=seconds)
+        return _worker(os.getpid()).call(_limited, Path.cwd(), available(), function, arguments, timeout=seconds)
     except WorkerLost as error:
         raise InputError(f"{path} makes its reader crash, so it {DAMAGED}") from error
     except TimeLimit as error:
@@ -54,8 +54,9 @@ def _worker(_process: int) -> Worker:
     return worker
 
 
-def _limited(most: int | None, function: Callable[..., T], arguments: tuple[object, ...]) -> T:
-    """Call a function that may take no more than ``most`` bytes beside what the process has."""
+def _limited(folder: Path, most: int | None, function: Callable[..., T], arguments: tuple[object, ...]) -> T:
+    """Call a function in ``folder`` that may take no more than ``most`` bytes beside what the process has."""
+    os.chdir(folder)
     if most is not None:
         try:
             import resource

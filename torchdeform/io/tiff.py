@@ -1,11 +1,9 @@
-"""TIFF: pages as a volume, channels, colour tables, and the spacing from the tags that microscopes write."""
+"""TIFF: known by content; pages as a volume, the full picture of a slide, channels, colours, and a scale if meant."""
 
 import logging
 import math
-import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
@@ -15,59 +13,118 @@ import torch
 from numpy.typing import NDArray
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.image import Image
+from torchdeform.core.image import UNITS, Image
+from torchdeform.core.memory import available
 from torchdeform.errors import InputError
-from torchdeform.io import itk
-from torchdeform.io.gate import DAMAGED
+from torchdeform.io.gate import CROP, DAMAGED, reading, require_beside, require_room
+from torchdeform.io.tiff_pixels import orientation_of, require_colours, shown, unpacked
+from torchdeform.io.tiff_scale import Scale, scale
 
 if TYPE_CHECKING:
-    from tifffile import TiffFile
+    from tifffile import TiffFile, TiffPageSeries
 
-# Length of a unit in millimetres, by the names that ImageJ and OME write. Shorter ones than 0.1 mm are shown in µm.
-_MILLIMETRES = {
-    "nm": 1e-6, "nanometer": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "\\u00b5m": 1e-3, "micron": 1e-3,
-    "microns": 1e-3, "micrometer": 1e-3, "mm": 1.0, "millimeter": 1.0, "cm": 10.0, "centimeter": 10.0, "m": 1e3,
-    "inch": 25.4, "in": 25.4,
-}  # fmt: skip
-_RESOLUTION_UNITS = {2: 25.4, 3: 10.0}  # of the resolution tag: inch and centimetre in mm
+    Series = Sequence[TiffPageSeries]
+
 _NAMES = {"px": "pixel", "µm": "micron"}  # of ImageJ, whose descriptions are in ASCII
-_ONE = 1e-6  # mm by which sizes of pixels may differ from 1 and count as none
 _DEPTH, _CHANNELS = "ZQI", "CS"  # letters of tifffile for axes: depth or unnamed pages; channels or samples
-_DAMAGE_SIGNS = ("invalid offset", "invalid value offset", "invalid page offset", "corrupted")
-_ERRORS = (OSError, ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError, struct.error)
+_DAMAGE_SIGNS = (
+    "invalid offset",
+    "invalid value offset",
+    "invalid page offset",
+    "corrupted",
+    "Missing data are zeroed",
+)
+
+# Formats of slide scanners, by tifffile's names, whose pages do not all show the tissue; the largest does.
+_SLIDES = {"svs", "ndpi", "scn", "bif", "philips", "qpi"}
+_ASIDE = ("label", "macro", "thumbnail", "overview")  # names of images that are not the slide's
+_REDUCED, _MASK = 1, 4  # bits of NewSubfileType
+_KEPT = 4  # bytes of a number of float32, which all become
+_TYPES = ("uint8", "uint16", "float32")  # of ImageJ
 
 
 def read_tiff(path: Path) -> Image:
-    """Read a TIFF: one page as a 2D image, pages as a volume. Spacing in mm from its tags, 1 without such tags.
+    """Read a TIFF: one page as a 2D image, pages as a volume, a slide at its full size.
 
     Args:
         path: the file.
 
     Raises:
-        InputError: damaged, pages of different sizes, several time points, or complex numbers.
+        InputError: damaged, larger than what is free, packed or coloured in a way that is unknown here, pages of
+            different sizes, several time points, or complex numbers.
 
     Notes:
-        Understands the spacing of ImageJ, of OME and of the resolution tags, and colour tables.
+        The scale is that of `tiff_scale.scale`; without one, pixels and pages are 1 apart. Colours, white-is-zero and
+        orientation are as a viewer shows them. Labels, macros, thumbnails and smaller levels of slides are left out.
+    """
+    with _opened(path) as (file, series):
+        axes, shape = _require_one(series, path)
+        page = series[0].keyframe
+        found = scale(file, page)
+        _require_room(series, path, found)
+        values = unpacked(series, path).reshape(shape)
+        if np.iscomplexobj(values):
+            raise InputError(f"{path} holds complex numbers; save their magnitude and give that")
+        pixels = shown(_ordered(axes, values), page)
+        if orientation_of(page) > 4:
+            found = ((found[0][0], found[0][2], found[0][1]), found[1])
+        return _image(pixels, found, str(path))
+
+
+def tiff_size(path: Path) -> tuple[tuple[int, ...], int]:
+    """Return the shape, without axes of one sample, and the number of channels of a TIFF, from its header.
+
+    Raises:
+        InputError: as `read_tiff`, as far as the header tells.
+    """
+    with _opened(path) as (_, series):
+        axes, shape = _require_one(series, path)
+        lengths = dict(zip(axes, shape, strict=True))
+        channels = math.prod(n for axis, n in lengths.items() if axis in _CHANNELS)
+        spatial = [math.prod(n for axis, n in lengths.items() if axis not in "YX" + _CHANNELS)]
+        spatial += [lengths.get(axis, 1) for axis in ("YX" if orientation_of(series[0].keyframe) <= 4 else "XY")]
+        one = np.zeros((channels, 1, 1, 1), series[0].dtype)
+        return tuple(n for n in spatial if n > 1), len(shown(one, series[0].keyframe))
+
+
+def tiff_parts(path: Path) -> list[Path]:
+    """Return the other files that hold pixels of an OME-TIFF.
+
+    Raises:
+        InputError: one of them is missing, or not beside or below the first.
     """
     import tifffile
 
+    with reading(path), _log_messages(), tifffile.TiffFile(path, is_ome=False) as file:
+        text = file.pages.first.description
+    return _parts(text, path) if text.rstrip().endswith("OME>") else []
+
+
+def _parts(text: str, path: Path) -> list[Path]:
     try:
-        with _log_messages() as messages, tifffile.TiffFile(path) as file:
-            axes, shape = _require_one(file, path)
-            values, (spacing, unit) = _values(file, path, shape), _spacing(file)
-            table = file.series[0].keyframe.colormap
-    except InputError:
-        raise
-    except _ERRORS as error:
-        raise InputError(f"{path} {DAMAGED}") from error
-    if any(sign in line for line in messages for sign in _DAMAGE_SIGNS):
-        raise InputError(f"{path} {DAMAGED}")
-    if table is not None and values.dtype.kind == "u" and values.max() < table.shape[1]:
-        colours = np.take(table // 256, values.astype(np.intp), axis=1)  # a table has 16 bits, the picture 8
-        axes, values = axes + "S", np.moveaxis(colours, 0, -1).astype(np.uint8)
-    if np.iscomplexobj(values):
-        raise InputError(f"{path} holds complex numbers; save their magnitude and give that")
-    return replace(_image(axes, values, spacing, str(path)), unit=unit)
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError:
+        return []
+    others = [e for e in root.iterfind(".//{*}TiffData/{*}UUID") if e.text is None or e.text != root.get("UUID")]
+    names = dict.fromkeys(e.get("FileName", path.name) for e in others)
+    parts = [path.parent / name for name in names if name.lower() != path.name.lower()]
+    for part in parts:
+        require_beside(part, path)
+    return parts
+
+
+@contextmanager
+def _opened(path: Path) -> "Iterator[tuple[TiffFile, Series]]":
+    """Open a file and find the series that make the image; what goes wrong becomes one sentence."""
+    import tifffile
+
+    tiff_parts(path)
+    with reading(path), _log_messages() as messages:
+        # tifffile would follow Micro-Manager's index into other files, that nobody named and nothing checks.
+        with tifffile.TiffFile(path, is_ndtiff=False, is_mmstack=False) as file:
+            yield file, _shown_series(file)
+        if any(sign in line for line in messages for sign in _DAMAGE_SIGNS):
+            raise InputError(f"{path} {DAMAGED}")
 
 
 @contextmanager
@@ -86,101 +143,95 @@ def _log_messages() -> Iterator[list[str]]:
         log.propagate = before
 
 
-def _require_one(file: "TiffFile", path: Path) -> tuple[str, tuple[int, ...]]:
-    """Return the letters and lengths of the axes; `InputError` unless the file is one image or volume."""
-    first, *others = file.series
+def _shown_series(file: "TiffFile") -> "Series":
+    """Return the series of pages that show what the file is of: no smaller copies, masks, labels or macros."""
+    full = [one for one in file.series if not int(one.keyframe.subfiletype) & (_REDUCED | _MASK)]
+    full = [one for one in full if not any(word in one.name.lower() for word in _ASIDE)] or file.series
+    return [max(full, key=lambda one: one.size)] if file.flags & _SLIDES else full
+
+
+def _require_one(series: "Series", path: Path) -> tuple[str, tuple[int, ...]]:
+    """Return the letters and lengths of the axes; `InputError` unless the series are one image or volume."""
+    first, *others = series
+    require_colours(first.keyframe, path)
     if any(s.shape != first.shape for s in others):
-        sizes = ", ".join("×".join(map(str, s.shape)) for s in file.series[:3])
+        sizes = ", ".join("×".join(map(str, s.shape)) for s in series[:3])
         raise InputError(f"{path} has pages of different sizes ({sizes}); save the page that you want and give that")
     several = {axis: n for axis, n in zip(first.axes, first.shape, strict=True) if n > 1}
     if others and not set(several) & set(_DEPTH):  # pages written one by one
         return _DEPTH[0] + first.axes, (1 + len(others), *first.shape)
     other = [n for axis, n in several.items() if axis not in "YX" + _DEPTH + _CHANNELS]
     if other or others:
-        count = math.prod(other) * len(file.series)
+        count = math.prod(other) * len(series)
         raise InputError(f"{path} is a series of {count} images or time points; save one of them and give that")
     return first.axes, first.shape
 
 
-def _values(file: "TiffFile", path: Path, shape: tuple[int, ...]) -> NDArray[np.generic]:
-    """Return the pixels. ITK reads compressions (LZW, JPEG) that tifffile does not know without further packages."""
-    try:
-        return np.stack([series.asarray() for series in file.series]).reshape(shape)
-    except ValueError as error:
-        if "imagecodecs" not in str(error):
-            raise
-    values = itk.values(path)
-    if values.size != math.prod(shape):  # ITK adds alpha to the colours of JPEG
-        values = values[..., :3]
-    return values.reshape(shape)
+def _require_room(series: "Series", path: Path, found: Scale) -> None:
+    """Raise `InputError` unless the pixels can be in the file and fit into memory, and the largest piece too."""
+    page, count = series[0].keyframe, sum(one.size for one in series)
+    size = np.dtype(page.dtype).itemsize
+    require_room(path, math.prod(page.chunks) * size)
+    packed = count * page.bitspersample // 8
+    require_room(path, packed, held=count * (size + _KEPT), remedy=_smaller(series[0], path, size + _KEPT, found))
 
 
-def _spacing(file: "TiffFile") -> tuple[tuple[float, float, float], str]:
-    """Return the distances of pages, rows and columns in mm, 1 without tags, and the unit to show them in."""
-    ome, imagej, page = file.ome_metadata, file.imagej_metadata, file.series[0].keyframe
-    if ome and (found := _ome_spacing(ome)):
-        return found
-    tagged = "XResolution" in page.tags and page.resolution != (1, 1)
-    down, across = (1 / r if 0 < r < math.inf else 1.0 for r in reversed(page.resolution))
-    depth, unit, shown = 1.0, _RESOLUTION_UNITS.get(int(page.resolutionunit)) if tagged else None, "mm"
-    if imagej and imagej.get("unit"):
-        known = _MILLIMETRES.get(str(imagej["unit"]).lower())
-        unit, shown = known or 1.0, _shown(known)
-        depth = float(imagej.get("spacing", 1.0)) * unit
-    if unit is None or (abs(down * unit - 1) + abs(across * unit - 1) < _ONE and not imagej):
-        return (1.0, 1.0, 1.0), "px"  # ITK writes the resolution of 1 mm where an image has none
-    return (abs(depth) or 1.0, down * unit, across * unit), shown
+def _smaller(series: "TiffPageSeries", path: Path, size: int, found: Scale) -> str:
+    """Return what to do with a slide that is too large, or with any other image."""
+    pages = [level.keyframe for level in series.levels]
+    if len(pages) < 2:
+        return CROP
+    names = [f"{k} ({page.imagewidth}×{page.imagelength})" for k, page in enumerate(pages)]
+    room = available() or math.inf
+    best = next((k for k, level in enumerate(series.levels) if k and level.size * size <= room), len(pages) - 1)
+    (_, down, across), unit = found
+    factor = UNITS[unit] * pages[0].imagewidth / pages[best].imagewidth
+    scale_of = f"resolution=({1 / (across * factor):.9g}, {1 / (down * factor):.9g})"
+    return (
+        f"save one of its smaller levels {', '.join(names[1:])} and give that: import tifffile; "
+        f"tifffile.imwrite('level.tif', tifffile.imread('{path}', level={best}), imagej=True, {scale_of}, "
+        f"metadata={{'unit': '{_NAMES.get(unit, unit)}'}})"
+    )
 
 
-def _shown(millimetres: float | None) -> str:
-    """Return the unit to show lengths in, by the length of the file's unit."""
-    return "px" if millimetres is None else "µm" if millimetres < 0.1 else "mm"
-
-
-def _ome_spacing(text: str) -> tuple[tuple[float, float, float], str] | None:
-    """Return PhysicalSizeZ, Y, X in mm and their unit; None if the description has no sizes or cannot be read."""
-    try:
-        pixels = ElementTree.fromstring(text).find(".//{*}Pixels")
-    except ElementTree.ParseError:
-        return None
-    if pixels is None or "PhysicalSizeX" not in pixels.attrib:
-        return None
-    units = [_MILLIMETRES.get(pixels.get(f"PhysicalSize{axis}Unit", "µm"), 1.0) for axis in "ZYX"]
-    sizes = [float(pixels.get(f"PhysicalSize{axis}", "nan")) * unit for axis, unit in zip("ZYX", units, strict=True)]
-    down, across, depth = sizes[1], sizes[2], sizes[0] if sizes[0] > 0 else 1.0
-    return ((depth, down, across), _shown(units[2])) if down > 0 and across > 0 else None
-
-
-def _image(axes: str, values: NDArray[np.generic], spacing: tuple[float, float, float], name: str) -> Image:
-    """Return pixels whose axes have letters as an image: channels, depth, rows, columns."""
+def _ordered(axes: str, values: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Return pixels whose axes have letters as channels, depth, rows, columns."""
     order = sorted(range(len(axes)), key=lambda k: (axes[k] not in _CHANNELS, axes[k] in "YX", axes[k] == "X"))
     ordered = np.transpose(values, order)
     channels = math.prod(n for n, axis in zip(values.shape, axes, strict=True) if axis in _CHANNELS)
-    pixels = ordered.reshape(channels, -1, *ordered.shape[-2:])
+    return ordered.reshape(channels, -1, *ordered.shape[-2:])
+
+
+def _image(pixels: NDArray[np.generic], found: Scale, name: str) -> Image:
+    """Return pixels ``(C, Z, Y, X)`` as an image without axes of one sample."""
     used = [k for k in range(3) if pixels.shape[k + 1] > 1]
     if len(used) < 2:
         raise InputError(f"{name} has size {list(pixels.shape[1:])}; give an image with at least two axes")
-    shape = tuple(pixels.shape[k + 1] for k in used)
-    if channels == 2 and axes[-1] == "S":  # grey with alpha
-        pixels = pixels[[0, 0, 0, 1]]
+    (spacing, unit), shape = found, tuple(pixels.shape[k + 1] for k in used)
     data = torch.from_numpy(np.ascontiguousarray(pixels, dtype=np.float32).reshape(1, -1, *shape))
-    kind = "uint8" if values.dtype.kind == "b" else values.dtype.name
-    return Image(data, Grid(shape, tuple(spacing[k] for k in used)), name=name, pixel_type=kind)
+    kind = "uint8" if pixels.dtype.kind == "b" else pixels.dtype.name
+    return Image(data, Grid(shape, tuple(spacing[k] for k in used)), name=name, pixel_type=kind, unit=unit)
+
+
+def can_page(values: NDArray[np.generic], dim: int) -> bool:
+    """Return whether `write_tiff` can write values ``(C, *S)``: ImageJ has no colours in 2D but those of 8 bits."""
+    return values.dtype.name in _TYPES and (dim == 3 or values.dtype == np.uint8 or len(values) not in (3, 4))
 
 
 def write_tiff(values: NDArray[np.generic], spacing: Sequence[float], unit: str, path: Path) -> None:
-    """Write a volume as the pages of a TIFF for ImageJ, with the distance of the pages in its description.
+    """Write an image as the pages of a TIFF for ImageJ, with its scale in the description.
 
     Args:
-        values: ``(C, Z, Y, X)`` of a type that ImageJ has: uint8, uint16 or float32.
-        spacing: distances of pages, rows and columns in ``unit``.
+        values: ``(C, Y, X)`` or ``(C, Z, Y, X)`` of a type that ImageJ has: uint8, uint16 or float32.
+        spacing: distances of pages, if there are any, rows and columns in ``unit``.
         unit: one of `UNITS`.
         path: the file.
     """
     import tifffile
 
-    depth, down, across = spacing
-    colour = values.dtype == np.uint8 and values.shape[0] in (3, 4)
+    depth, down, across = (1.0, *spacing)[-3:]
+    values = values.reshape(len(values), -1, *values.shape[-2:])
+    colour = values.dtype == np.uint8 and len(values) in (3, 4)
     tifffile.imwrite(
         path,
         np.moveaxis(values, 0, -1 if colour else 1),

@@ -15,8 +15,9 @@ from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Stage, Transform
 from torchdeform.errors import InputError
 from torchdeform.io import itk
-from torchdeform.io.files import atomic_folder, native_stderr, suffix
-from torchdeform.io.validation import require_sound
+from torchdeform.io.files import atomic_folder, native_stderr, require_space, suffix
+from torchdeform.io.gate import require_file
+from torchdeform.io.volumes import read_volume
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
@@ -61,11 +62,8 @@ def read_displacement(path: _Path) -> Image:
         InputError: the file is missing, damaged, or not a field of D components.
     """
     file = Path(path)
-    require_sound(file)
-    try:
-        return _to_field(itk.to_image(itk.load(file), str(path)))
-    except RuntimeError as error:
-        raise InputError(f"{path} cannot be read ({itk.reason(error)}); it may be damaged: write it again") from error
+    require_file(file, "displacement field")
+    return _to_field(itk.volume_image(read_volume(file), str(path)))
 
 
 def voxel_displacement(u: Tensor, fixed: Image, moving: Image) -> Tensor:
@@ -182,7 +180,7 @@ def read_transform(path: _Path) -> Transform:
             displacement field (for instance a B-spline).
     """
     file = Path(path)
-    require_sound(file)
+    require_file(file, "transform")
     if suffix(file) in FIELDS:
         field = read_displacement(file)
         return Transform((Displacement(replace(field, data=field.data.double())),))
@@ -280,6 +278,7 @@ def _save(transform: "sitk.Transform", path: Path) -> None:
     import SimpleITK as sitk
 
     with atomic_folder(path.parent) as folder:
+        require_space(folder, 8 * transform.GetNumberOfParameters())  # HDF5 cannot close a file on a full disk
         try:
             with native_stderr():
                 sitk.WriteTransform(transform, str(folder / path.name))
