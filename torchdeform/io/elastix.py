@@ -8,13 +8,14 @@ from pathlib import Path, PureWindowsPath
 import numpy as np
 
 from torchdeform.errors import InputError
-from torchdeform.io.gate import read_text
+from torchdeform.io.gate import read_text, reading
 from torchdeform.io.maps import Linear, Numbers, Spline
 
 _ENTRY = re.compile(r"\((\w+)\s(.*)\)\s*(?://.*)?")
 _VALUE = re.compile(r'"([^"]*)"|([^\s"]+)')
 _START = re.compile(rb"\s*(//[^\n]*\n\s*)*\(\w+[ \t]")
 _INITIAL = ("InitialTransformParameterFileName", "InitialTransformParametersFileName")
+_INCOMPLETE = "lacks values of its transform, or has some that do not fit; write it again"
 _LONGEST = 32  # files that build on each other
 
 _ADVICE = "run `transformix -def all -tp {} -out folder` and give its deformationField"
@@ -40,11 +41,9 @@ def _read(path: Path, above: tuple[Path, ...]) -> list[Linear | Spline]:
     if path in above or len(above) > _LONGEST:
         raise InputError(f"{path} builds on itself; correct its InitialTransformParametersFileName")
     entries = _parse(path)
-    name = next((entries[key][0] for key in _INITIAL if entries.get(key)), "NoInitialTransform")
-    try:
+    with reading(path, _INCOMPLETE):
         own = _map(path, entries)
-    except (KeyError, IndexError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} lacks values of its transform ({error}); write it again") from error
+    name = next((entries[key][0] for key in _INITIAL if entries.get(key)), "NoInitialTransform")
     if name == "NoInitialTransform":
         return [own]
     before = _read(_beside(path, name), (*above, path))

@@ -82,28 +82,32 @@ class Spline:
             spline are no larger than the second differences of its coefficients.
         """
         shape = np.array(self.vectors.shape[:-1])
-        if not np.isfinite(self.vectors).all() or min(shape) <= self.order:
-            raise InputError(f"{name} holds a B-spline without a domain or with numbers that are not finite")
+        if not np.isfinite(self.vectors).all() or min(shape) <= self.order or self.order < 1:
+            raise InputError(f"{name} holds a B-spline that is stepped, has no domain or numbers that are not finite")
         cell = float(min(self.spacing))
         cuts = self._cuts(min(_CLOSE, _SHARE * cell))
-        if math.prod((shape - self.order) * cuts + 1) > _NODES:
+        if self._nodes(cuts) > _NODES:
             cuts = self._cuts(_SHARE * cell)
-        if math.prod(nodes := (shape - self.order) * cuts + 1) > _NODES:
+        if self._nodes(cuts) > _NODES:
             raise InputError(f"{name} holds a B-spline that is too rough for a field; {to_field(name)}")
         values = self.vectors
         for axis, (count, cut) in enumerate(zip(shape, cuts, strict=True)):
             weights = _weights(int(count), self.order, int(cut))
             values = np.moveaxis(np.tensordot(weights, values, axes=(1, axis)), 0, axis)
-        start = np.full(len(nodes), (self.order - 1) / 2)
-        origin = self.origin + self.direction @ (self.spacing * start)
+        origin = self.origin + self.direction @ (self.spacing * (self.order - 1) / 2)
         return Field(np.ascontiguousarray(values), origin, self.spacing / cuts[::-1], self.direction)
 
     def _cuts(self, error: float) -> NDArray[np.int64]:
         """Return into how many parts a cell must be cut along each array axis."""
         axes = range(self.vectors.ndim - 1)
-        bends = [np.linalg.norm(np.diff(self.vectors, 2, axis), axis=-1).max(initial=0.0) for axis in axes]
+        with np.errstate(over="ignore"):  # then there are too many nodes
+            bends = [np.linalg.norm(np.diff(self.vectors, 2, axis), axis=-1).max(initial=0.0) for axis in axes]
         wanted = np.sqrt(len(bends) * np.array(bends) / (8 * error)) * (self.order > 1)
         return np.clip(np.ceil(wanted), 1, _NODES).astype(np.int64)
+
+    def _nodes(self, cuts: NDArray[np.int64]) -> int:
+        sizes = zip(self.vectors.shape, cuts.tolist(), strict=False)
+        return math.prod((count - self.order) * cut + 1 for count, cut in sizes)
 
 
 def _weights(count: int, order: int, cuts: int) -> Numbers:
