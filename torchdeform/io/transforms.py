@@ -98,7 +98,9 @@ def _load_vectors(path: Path) -> "sitk.Image":
     whole = itk.quietly(reader.Execute)
     if isinstance(whole, RuntimeError):
         raise whole
-    vectors = sitk.Compose([whole[:, :, :, k] for k in range(size[3])])
+    values = sitk.GetArrayFromImage(whole).reshape(size[::-1])
+    vectors = sitk.GetImageFromArray(np.ascontiguousarray(np.moveaxis(values, 0, -1)), isVector=True)
+    vectors.CopyInformation(whole[:, :, :, 0])
     _require_displacements(vectors, path)
     return vectors
 
