@@ -18,6 +18,8 @@ _OF_MACHINE = {
 # Set in the environment: the shell shows the traceback of an error.
 TRACEBACK = "TORCHDEFORM_TRACEBACK"
 
+_WIDEST, _MOST_BITS = 80, 1000  # characters of a wrong value, and bits of a number, that are shown
+
 
 class TorchdeformError(Exception):
     """Base of every error that this package raises on purpose."""
@@ -44,9 +46,17 @@ def of_machine(error: BaseException | None) -> OSError | MachineError | None:
     return None
 
 
+def shown(value: object) -> str:
+    """Return a wrong value as it is written, as far as a sentence has room for it."""
+    if isinstance(value, int) and value.bit_length() > _MOST_BITS:  # Python refuses to write the longest
+        return "a number of too many digits"
+    text = repr(value)
+    return text if len(text) <= _WIDEST else f"{text[:_WIDEST]}..."
+
+
 def nearest_name(name: str, known: Iterable[str]) -> str:
     """Return ``"; did you mean 'x'?"`` for the known name nearest to ``name``, else an empty string."""
-    match = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    match = difflib.get_close_matches(name[:_WIDEST], list(known), n=1, cutoff=0.5)
     return f"; did you mean '{match[0]}'?" if match else ""
 
 
@@ -55,7 +65,8 @@ def require_choice(value: object, choices: Iterable[object], where: str) -> None
     known = list(choices)
     if value not in known:
         names = [str(choice) for choice in known]
-        raise InputError(f"{where} must be one of {', '.join(names)}, got {value!r}{nearest_name(str(value), names)}")
+        hint = nearest_name(value, names) if isinstance(value, str) else ""
+        raise InputError(f"{where} must be one of {', '.join(names)}, got {shown(value)}{hint}")
 
 
 # What a number must be: the test, and the words for it; those that are asked for often have a name.
@@ -86,7 +97,7 @@ def require_ranges(settings: object, prefix: str, **ranges: str | Range) -> None
         value = getattr(settings, name)
         numbers = value if isinstance(value, tuple | list) else (value,)
         if not numbers or not all(number is None or fits(number) for number in numbers):
-            raise InputError(f"{prefix}{name} must {words}, got {value!r}")
+            raise InputError(f"{prefix}{name} must {words}, got {shown(value)}")
 
 
 def explain(error: Exception) -> tuple[str, int]:

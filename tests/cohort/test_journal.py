@@ -9,7 +9,9 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import SimpleITK as sitk
 from nested_settings import changed
 
 from torchdeform.cohort.journal import JOURNAL, Journal, Record, open_lines
@@ -211,12 +213,19 @@ def test_a_file_that_comes_back_changes_the_print(tmp_path, job):
     assert fingerprint(tmp_path, job) != missing
 
 
-def test_pixels_in_a_file_of_their_own_count(tmp_path, job):
-    (tmp_path / "fixed.mhd").write_text("ElementDataFile = fixed.raw", encoding="ascii")
-    (tmp_path / "fixed.raw").write_bytes(b"1")
-    detached = replace(job, files=replace(job.files, fixed=tmp_path / "fixed.mhd"))
-    before = fingerprint(tmp_path, detached)
-    (tmp_path / "fixed.raw").write_bytes(b"2")
+@pytest.mark.parametrize(
+    ("header", "data"), [("a.mhd", "a.raw"), ("a.nhdr", "a.raw"), ("a.hdr", "a.img"), ("a.mhd", "b.raw")]
+)
+def test_pixels_in_a_file_of_their_own_count(tmp_path, job, header, data):
+    sitk.WriteImage(sitk.GetImageFromArray(np.zeros((4, 5, 6), np.uint8)), str(tmp_path / header))
+    if data == "b.raw":
+        (tmp_path / "a.raw").rename(tmp_path / data)
+        text = (tmp_path / header).read_text(encoding="ascii").replace("a.raw", data)
+        (tmp_path / header).write_text(text, encoding="ascii")
+    detached = replace(job, files=replace(job.files, fixed=tmp_path / header))
+    before, status = fingerprint(tmp_path, detached), (tmp_path / data).stat()
+    (tmp_path / data).write_bytes(bytes(status.st_size - 1) + b"1")
+    os.utime(tmp_path / data, ns=(status.st_atime_ns, status.st_mtime_ns))
     assert fingerprint(tmp_path, detached) != before
 
 

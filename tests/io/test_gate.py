@@ -1,7 +1,10 @@
 """The gate of files: what is no regular file, too large, no text, or elsewhere is refused before it is opened."""
 
+import errno
 import os
 import socket
+import struct
+import warnings
 from pathlib import Path
 
 import pytest
@@ -103,3 +106,35 @@ def test_pixels_stand_beside_or_below_their_header(tmp_path):
     os.mkfifo(tmp_path / "pipe.raw")
     with pytest.raises(InputError, match="is no file but a device or a pipe"):
         require_beside(tmp_path / "pipe.raw", header)
+
+
+def test_room_counts_what_reading_takes(tmp_path, monkeypatch):
+    (tmp_path / "a").write_bytes(bytes(100))
+    monkeypatch.setattr(gate, "available", lambda: 1000)
+    gate.require_room(tmp_path / "a", 900)
+    with pytest.raises(InputError, match=r"1.1 kB of memory and 1 kB are free; do this"):
+        gate.require_room(tmp_path / "a", 900, held=1100, remedy="do this")
+
+
+@pytest.mark.parametrize(
+    "error", [AssertionError, KeyError("x"), RecursionError, struct.error, SyntaxError, OSError(22, "x")]
+)
+def test_whatever_a_library_raises_is_one_sentence(tmp_path, error):
+    with (
+        pytest.raises(InputError, match=r"a\.x is damaged or incomplete; fetch or export it again"),
+        gate.reading(tmp_path / "a.x"),
+    ):
+        raise error
+
+
+def test_reading_says_what_it_knows(tmp_path):
+    with pytest.raises(InputError, match="a takes more memory than there is"), gate.reading(tmp_path / "a"):
+        raise MemoryError
+    with pytest.raises(InputError, match="of its own"), gate.reading(tmp_path / "a"):
+        raise InputError("of its own")
+    with pytest.raises(InputError, match="a has a fault"), gate.reading(tmp_path / "a", "has a fault"):
+        raise ValueError
+    with pytest.raises(OSError, match="stale"), gate.reading(tmp_path / "a"):
+        raise OSError(errno.ESTALE, "stale")
+    with gate.reading(tmp_path / "a"):
+        warnings.warn("dropped", stacklevel=1)

@@ -10,7 +10,8 @@ import SimpleITK as sitk
 
 from torchdeform.errors import InputError
 from torchdeform.io.itk_maps import read
-from torchdeform.io.maps import Field, Linear, Spline
+from torchdeform.io.maps import Linear, Spline
+from torchdeform.io.volume import Volume
 
 KNOWN = "a transform of ITK"
 HEADER = "#Insight Transform File V1.0\n#Transform 0\n"
@@ -31,10 +32,10 @@ def test_parts_come_in_the_order_points_go_through_them(tmp_path, ending):
     composite = sitk.CompositeTransform([euler, sitk.DisplacementFieldTransform(field), spline])
     sitk.WriteTransform(composite, str(tmp_path / f"a{ending}"))
     found = read(tmp_path / f"a{ending}", KNOWN)
-    assert [type(part) for part in found] == [Spline, Field, Linear]
-    assert found[0].vectors.shape == (8, 7, 2)
-    np.testing.assert_allclose(np.moveaxis(found[0].vectors, -1, 0).ravel(), spline.GetParameters())
-    np.testing.assert_allclose(found[1].vectors, sitk.GetArrayFromImage(parts()[1].GetDisplacementField()))
+    assert [type(part) for part in found] == [Spline, Volume, Linear]
+    assert found[0].coefficients.values.shape == (8, 7, 2)
+    np.testing.assert_allclose(np.moveaxis(found[0].coefficients.values, -1, 0).ravel(), spline.GetParameters())
+    np.testing.assert_allclose(found[1].values, sitk.GetArrayFromImage(parts()[1].GetDisplacementField()))
     np.testing.assert_allclose(found[1].spacing, (2.0, 3.0))
     np.testing.assert_allclose(found[2].matrix.ravel(), euler.GetMatrix())
 
@@ -91,5 +92,5 @@ def test_mutated_files_are_read_or_refused(tmp_path, capfd, ending, seed):
         content[draw.randrange(len(content))] = draw.choice((0, 255, draw.randrange(256)))
     path.write_bytes(content)
     with suppress(InputError):
-        assert all(isinstance(part, Linear | Field | Spline) for part in read(path, KNOWN))
+        assert all(isinstance(part, Linear | Spline | Volume) for part in read(path, KNOWN))
     assert re.fullmatch("", "".join(capfd.readouterr()))

@@ -1,4 +1,6 @@
-"""TIFF: pages, channels, numbers of any width, and the spacing that programs leave in tags."""
+"""TIFF: pages, channels, numbers of any width, and files that make no sense."""
+
+import struct
 
 import numpy as np
 import pytest
@@ -7,7 +9,9 @@ import torch
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.io import read_image, write_image
+from torchdeform.io import gate, itk, read_image, write_image
+from torchdeform.io.images import image_size
+from torchdeform.io.tiff import tiff_size
 
 tifffile = pytest.importorskip("tifffile")
 PIL = pytest.importorskip("PIL.Image")
@@ -100,6 +104,113 @@ def test_what_is_no_image_is_refused(tmp_path, capfd, write, message):
         read_image(tmp_path / "a.tif")
     assert "a.tif" in str(error.value)
     assert capfd.readouterr() == ("", "")
+
+
+def outcome(path):
+    """Return why a file is refused, nothing where it is read, with pixels that are finite."""
+    try:
+        assert bool(read_image(path).data.isfinite().all())
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def tiny(**tags):
+    """The header of a TIFF and one page of 8 × 8 pixels, its tags changed; the pixels are behind it."""
+    entries = {256: 8, 257: 8, 258: 8, 259: 1, 262: 1, 273: 200, 277: 1, 278: 8, 279: 64}
+    entries |= {int(name[1:]): value for name, value in tags.items()}
+    head = struct.pack("<2sHIH", b"II", 42, 8, len(entries))
+    body = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in sorted(entries.items()))
+    return (head + body + bytes(4)).ljust(200, b"\0") + bytes(range(64))
+
+
+def test_the_tiny_file_is_sound(tmp_path):
+    (tmp_path / "a.tif").write_bytes(tiny())
+    assert read_image(tmp_path / "a.tif").data.flatten().tolist() == list(range(64))
+
+
+def test_bits_from_the_right(tmp_path):
+    """FillOrder 2."""
+    (tmp_path / "a.tif").write_bytes(tiny(t258=1, t266=2, t279=8))
+    with PIL.open(tmp_path / "a.tif") as picture:
+        wanted = np.asarray(picture)
+    assert np.array_equal(read_image(tmp_path / "a.tif").data[0, 0].numpy(), wanted)
+    assert wanted[1].tolist() == [1, 0, 0, 0, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {"t256": 100_000, "t257": 100_000},
+        {"t256": 2**31, "t257": 2**31},
+        {"t256": 2**32 - 1, "t257": 2**32 - 1, "t277": 65_535},
+        {"t322": 2**20, "t323": 2**20, "t324": 200, "t325": 64},
+        {"t258": 65_535},
+        {"t258": 0},
+        {"t277": 0},
+        {"t257": 0},
+        {"t273": 2**32 - 1},
+        {"t279": 2**32 - 1},
+        {"t278": 0},
+        {"t259": 9999},
+        {"t259": 5},
+        {"t259": 7},
+        {"t284": 9},
+        {"t274": 99},
+        {"t262": 99},
+        {"t339": 99},
+        {"t317": 99},
+        {"t330": 8},
+    ],
+)
+def test_a_page_that_makes_no_sense(tmp_path, capfd, tags):
+    """One sentence, or a picture; nothing is printed, and no memory taken for what is only announced."""
+    (tmp_path / "a.tif").write_bytes(tiny(**tags))
+    said = outcome(tmp_path / "a.tif")
+    assert not said or said.startswith(str(tmp_path / "a.tif"))
+    assert "\n" not in said
+    image_size(tmp_path / "a.tif")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_pages_in_a_ring(tmp_path):
+    content = bytearray(tiny())
+    struct.pack_into("<I", content, 8 + 2 + 12 * 9, 8)
+    (tmp_path / "a.tif").write_bytes(content)
+    said = outcome(tmp_path / "a.tif")
+    assert not said or "damaged" in said
+
+
+def test_a_volume_larger_than_what_is_free_is_refused(tmp_path, monkeypatch):
+    tifffile.imwrite(tmp_path / "a.tif", values((5, 20, 30)), photometric="minisblack")
+    monkeypatch.setattr(gate, "available", lambda: 10_000)
+    with pytest.raises(InputError, match="18 kB of memory and 10 kB are free; crop it"):
+        read_image(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(
+    ("shape", "how", "wanted"),
+    [
+        ((20, 30), {"photometric": "minisblack"}, ((20, 30), 1)),
+        ((5, 20, 30), {"photometric": "minisblack"}, ((5, 20, 30), 1)),
+        ((20, 30, 3), {"photometric": "rgb"}, ((20, 30), 3)),
+        ((3, 20, 30), {"photometric": "rgb", "planarconfig": "separate"}, ((20, 30), 3)),
+        ((20, 30, 4), {"photometric": "separated"}, ((20, 30), 3)),
+        ((5, 2, 20, 30), {"imagej": True, "metadata": {"axes": "ZCYX"}}, ((5, 20, 30), 2)),
+        ((20, 30), {"photometric": "minisblack", "extratags": [(274, 3, 1, 6, True)]}, ((30, 20), 1)),
+    ],
+)
+def test_sizes_are_known_without_the_pixels(tmp_path, shape, how, wanted):
+    tifffile.imwrite(tmp_path / "a.tif", values(shape, "uint8"), **how)
+    image = read_image(tmp_path / "a.tif")
+    assert tiff_size(tmp_path / "a.tif") == image_size(tmp_path / "a.tif") == wanted
+    assert (image.grid.shape, image.data.shape[1]) == wanted
+
+
+def test_itk_is_not_given_tiff(tmp_path):
+    tifffile.imwrite(tmp_path / "a.mha", values((20, 30)))
+    with pytest.raises(InputError, match=r"a.mha is a TIFF"):
+        itk.load(tmp_path / "a.mha")
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9, 0.99])

@@ -1,7 +1,5 @@
 """Settings: every way to give them, and every way to give them wrongly."""
 
-import errno
-import os
 from dataclasses import asdict
 
 import pytest
@@ -89,7 +87,7 @@ def test_malformed_overrides(text):
         ("window: 5\nwindow: 7", r"settings.yaml is no valid YAML at line 2: window is given twice"),
         ("window: [5", r"settings.yaml is no valid YAML at line 1"),
         ("- window", "must hold 'key: value' lines"),
-        ("5: window", "must hold 'key: value' lines"),
+        ("5: window", "at line 1: the key 5 is no text; write it in quotes"),
         ("window: !!python/object/apply:os.getcwd []", "is no valid YAML"),
     ],
 )
@@ -99,10 +97,10 @@ def test_wrong_files_are_explained(tmp_path, text, message):
 
 
 def test_missing_and_unreadable_files(tmp_path):
-    with pytest.raises(InputError, match=os.strerror(errno.ENOENT)):
+    with pytest.raises(InputError, match=r"no\.yaml does not exist"):
         load_settings(file=tmp_path / "no.yaml")
-    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(InputError, match=r"binary.yaml is no valid YAML"):
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match=r"binary.yaml is no text"):
         load_settings(file=tmp_path / "binary.yaml")
 
 

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -18,14 +18,13 @@ from torchdeform import __version__
 from torchdeform.cohort.plan import Job
 from torchdeform.cohort.task import DONE, PairReport
 from torchdeform.errors import InputError, MachineError, of_machine
-from torchdeform.io.dicom import is_dicom
-from torchdeform.io.files import disk_failure, stem
+from torchdeform.io.files import disk_failure
 from torchdeform.io.gate import require_file
+from torchdeform.io.parts import files_of
 
 JOURNAL = "journal.jsonl"
 
 _SETTLED = 2_000_000_000  # ns; age from which on unchanged dates mean unchanged content
-_HEADERS = (".mhd", ".nhdr", ".hdr", ".img")  # formats with header and pixels in two files
 _UNREADABLE = "unreadable"
 _LONGEST = 1_000_000  # bytes of a line
 _DATE = b'{"file": '  # how lines begin that earlier versions wrote about dates of files
@@ -135,7 +134,7 @@ class Journal:
             "memory": job.memory,
             "report": job.report,
             "voxels": job.voxels,
-            "submission": None if job.submission is None else job.submission.name,
+            "submission": [path.name for path in (job.submission, *job.also) if path is not None],
             "inputs": inputs,
         }
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
@@ -143,8 +142,10 @@ class Journal:
     def _digest(self, path: Path) -> str:
         """Return the hash of an image's content; images that cannot be read share one hash."""
         try:
-            digests = [self._digest_file(file) for file in _files_of(path)]
-        except (OSError, InputError):
+            digests = [self._digest_file(file) for file in files_of(path)]
+        except (OSError, InputError) as error:
+            if of_machine(error):
+                raise
             return _UNREADABLE
         return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
@@ -222,18 +223,6 @@ def append(file: int, record: Mapping[str, object]) -> None:
         with suppress(OSError):
             os.ftruncate(file, before)
         raise
-
-
-def _files_of(path: Path) -> Iterator[Path]:
-    """Yield all files of an image: those of a folder, of a series, or a header and its pixels."""
-    if path.is_dir():
-        yield from (p for p in sorted(path.rglob("*")) if p.is_file())
-    elif path.suffix.lower() in _HEADERS:
-        yield from (p for p in sorted(path.parent.iterdir()) if p.is_file() and stem(p) == stem(path))
-    elif is_dicom(path):
-        yield from (p for p in sorted(path.parent.iterdir()) if p.is_file())
-    else:
-        yield path
 
 
 def _sync_folder(folder: Path) -> None:

@@ -291,7 +291,7 @@ def _results_exist(job: Job, report: PairReport) -> bool:
 
 def _results(job: Job, report: PairReport) -> list[Path]:
     named = [job.files.out / name for name in filter(is_result, report.files)]
-    return named if job.submission is None else [*named, job.submission]
+    return named if job.submission is None else [*named, job.submission, *job.also]
 
 
 def _remove_results(job: Job, report: PairReport) -> None:

@@ -7,6 +7,7 @@ looks on, the methods of fixed steps are run from their tableaux here; a test sa
 import math
 import sys
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import pairwise
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchdeform.core.grid import Grid
+from torchdeform.core.grid import Grid, require_float
 from torchdeform.core.warp import compose, keep_inside, warp
 from torchdeform.errors import ComputationError, InputError, require_choice, require_ranges
 
@@ -168,6 +169,7 @@ def integrate_points(
     Notes:
         Order and cost are those of the method. Differentiable in the points and in whatever ``rate`` uses.
     """
+    require_float(points, "integrate_points: points")
     if points.dim() < 3 or points.shape[1] != grid.dim:
         raise InputError(f"integrate_points: points must have shape (B, {grid.dim}, *T), got {tuple(points.shape)}")
     require_times(times, "integrate_points")
@@ -248,11 +250,15 @@ def _torchdiffeq() -> Any:
     While torchdiffeq is imported a stand-in takes the place of that module. It gives out a `solve_ivp` that imports
     the real one when it is called, so that torchdiffeq's ``scipy_solver`` works for everybody else.
     """
-    if "torchdiffeq" in sys.modules or _UNUSED in sys.modules:
+    if "torchdiffeq" in sys.modules:
         return import_module("torchdiffeq")
-    sys.modules[_UNUSED] = _StandIn(_UNUSED)
+    if _UNUSED not in sys.modules:
+        sys.modules[_UNUSED] = _StandIn(_UNUSED)
     try:
-        return import_module("torchdiffeq")
+        # In a thread of its own: under a fake mode or a default device, which a thread does not hand on, the tables
+        # that torchdiffeq makes when it is imported would be fake, or on that device, for good.
+        with ThreadPoolExecutor(1) as thread:
+            return thread.submit(import_module, "torchdiffeq").result()
     finally:
         if isinstance(sys.modules.get(_UNUSED), _StandIn):
             del sys.modules[_UNUSED]

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchdeform.errors import InputError
+from torchdeform.errors import InputError, shown
 
 if TYPE_CHECKING:
     import torch
@@ -88,10 +88,10 @@ def parse_size(text: str) -> int:
         InputError: no such size, or none at all.
     """
     found = _SIZE.fullmatch(text)
-    size = round(float(found[1]) * _UNITS[(found[2] or "").lower()]) if found else 0
-    if size <= 0:
-        raise InputError(f"a size of memory is a number with a unit, such as 4GB or 512MB, got '{text}'")
-    return size
+    size = float(found[1]) * _UNITS[(found[2] or "").lower()] if found else 0
+    if not 0.5 < size < 2**63:
+        raise InputError(f"a size of memory is a number with a unit, such as 4GB or 512MB, got {shown(text)}")
+    return round(size)
 
 
 def readable(size: int, *, spaced: bool = True) -> str:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.derivatives import jacobian_determinant
-from torchdeform.core.grid import over_slabs
+from torchdeform.core.grid import over_slabs, require_float
 from torchdeform.core.image import AUTO, Image, independence, outside_value, overlap
 from torchdeform.core.interpolation import COPYING, LABEL_MODE, interpolator
 from torchdeform.core.warp import inside_box, invert, sample
@@ -40,6 +40,8 @@ class Affine:
         if dim not in (2, 3) or tuple(self.matrix.shape) != (dim, dim) or tuple(self.offset.shape) != (dim,):
             shapes = f"{tuple(self.matrix.shape)} and {tuple(self.offset.shape)}"
             raise InputError(f"Affine: matrix must be (D, D) and offset (D,) with D = 2 or 3, got {shapes}")
+        require_float(self.matrix, "Affine: matrix")
+        require_float(self.offset, "Affine: offset")
         if not bool(self.matrix.isfinite().all() and self.offset.isfinite().all()):
             raise InputError("Affine: matrix and offset must be finite")
         if independence(self.matrix) == 0:
@@ -53,7 +55,9 @@ class Affine:
     @classmethod
     def identity(cls, dim: int) -> "Affine":
         """Return x ↦ x in ``dim`` dimensions, float64."""
-        return cls(torch.eye(dim, dtype=torch.float64), torch.zeros(dim, dtype=torch.float64))
+        return cls(
+            torch.eye(dim, dtype=torch.float64, device="cpu"), torch.zeros(dim, dtype=torch.float64, device="cpu")
+        )
 
     def __call__(self, points: Tensor) -> Tensor:
         """Return M x + t for points ``(B, D, *T)``, in their type and on their device."""
@@ -85,7 +89,7 @@ class Affine:
 
 def place_of(image: Image) -> Image:
     """Return an image with the same grid and place, but zeros that take no memory as pixels."""
-    nothing = torch.zeros(()).expand(1, 1, *image.grid.shape)
+    nothing = torch.zeros((), dtype=torch.float32, device="cpu").expand(1, 1, *image.grid.shape)
     return replace(image, data=nothing)
 
 
@@ -272,9 +276,10 @@ class Transform:
         """
         rows = points.dim() == 2
         columns = points.T.unsqueeze(0) if rows else points
-        if columns.dim() < 3 or columns.shape[1] != self.dim or not points.is_floating_point():
-            given = f"{tuple(points.shape)} of {points.dtype}"
-            raise InputError(f"points must be floating-point (N, {self.dim}) or (B, {self.dim}, *T), got {given}")
+        require_float(points, "points")
+        if columns.dim() < 3 or columns.shape[1] != self.dim:
+            shapes = f"(N, {self.dim}) or (B, {self.dim}, *T)"
+            raise InputError(f"points must have shape {shapes}, got {tuple(points.shape)}")
         for stage in self.stages:
             columns = stage(columns)
         return columns[0].T if rows else columns

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.core.derivatives import LEAST_ROWS, cofactors, derivative, determinant, map_jacobian, slab_of
-from torchdeform.core.grid import Grid, over_slabs
+from torchdeform.core.grid import Grid, over_slabs, require_float
 from torchdeform.core.resampling import AVERAGE_POOL, prolong
 from torchdeform.errors import InputError, require_choice
 
@@ -63,9 +63,9 @@ def sample(
         Linear mode is second order, differentiable in image and points (almost everywhere).
     """
     grid.check(image, "sample: image")
-    if points.dim() < 3 or points.shape[1] != grid.dim or not points.is_floating_point():
-        given = f"{tuple(points.shape)} of {points.dtype}"
-        raise InputError(f"sample: points must be floating-point of shape (B, {grid.dim}, *T), got {given}")
+    require_float(points, "sample: points")
+    if points.dim() < 3 or points.shape[1] != grid.dim:
+        raise InputError(f"sample: points must have shape (B, {grid.dim}, *T), got {tuple(points.shape)}")
     values = _sample(image, _normalise([-1.0] * grid.dim, points, grid), mode)
     return with_outside(values, points, grid, outside)
 

@@ -44,7 +44,7 @@ class MonitorSettings:
     f_max: float = 1.0
     smoothing: float = 0.0
     dtype: torch.dtype = torch.float32
-    device: torch.device | str | None = None
+    device: torch.device | str = "cpu"
 
     def __post_init__(self) -> None:
         if not 0 < self.f_min <= self.f_max < math.inf:

@@ -141,7 +141,7 @@ def _simplices(dim: int) -> list[_Simplex]:
 
 def _part(simplex: _Simplex) -> float:
     """Return what makes the share of one node of the determinant of a simplex's edges, for one of two ways to cut."""
-    first, *others = (torch.tensor(corner, dtype=torch.float64) for corner in simplex)
+    first, *others = (torch.tensor(corner, dtype=torch.float64, device="cpu") for corner in simplex)
     orientation = determinant(torch.stack([other - first for other in others]).unsqueeze(0)).sign().item()
     return orientation / (math.factorial(len(simplex)) * 2)
 
@@ -250,7 +250,7 @@ def _shares(inside: Tensor, grid: Grid, smoothing: float) -> Tensor:
     outside, in the rest of Ω; regions that touch share the nodes between them.
     """
     labelled = (_WIDENING * smooth(inside[:, :-1], grid, smoothing)).clamp(max=1)
-    most = torch.where(inside[:, -1:] > 0, _MOST_OF_REST, 1.0)
+    most = torch.where(inside[:, -1:] > 0, _MOST_OF_REST, inside.new_ones(()))
     total = labelled.sum(dim=1, keepdim=True)
     labelled = labelled * (most / torch.maximum(total, most))
     return torch.cat([labelled, 1 - labelled.sum(dim=1, keepdim=True)], dim=1)

@@ -198,7 +198,7 @@ class _Symbols:
 
     def __init__(self, grid: Grid, axis: int, like: Tensor) -> None:
         size, spacing = grid.shape[axis], grid.spacing[axis]
-        theta = torch.arange(size, dtype=torch.float64) * (math.pi / (size - 1))
+        theta = torch.arange(size, dtype=torch.float64, device="cpu") * (math.pi / (size - 1))
         # 1 − cos θ without cancellation; the last sine is zero, not 1e-16.
         versine, sine = 2 * (theta / 2).sin() ** 2, theta.sin()
         sine[-1] = 0.0

@@ -20,6 +20,7 @@ _STDERR = threading.Lock()
 _PREFIX, _LOCK = ".torchdeform-", "lock"  # names of folders of unfinished files, and of the lock in each
 _A_DAY = 86400.0  # s
 _PROBE = 1 << 16  # bytes
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two with offsets of 64 bits (BigTIFF)
 
 
 def suffix(path: Path) -> str:
@@ -37,6 +38,11 @@ def read_head(path: Path, count: int) -> bytes:
     """Return the first bytes of a file."""
     with path.open("rb") as file:
         return file.read(count)
+
+
+def is_tiff(path: Path) -> bool:
+    """Return whether the content of a file starts like a TIFF, whatever its name: most slides are TIFF too."""
+    return read_head(path, 4) in _TIFF
 
 
 @contextmanager
@@ -322,21 +328,28 @@ def _nearest_folder(folder: Path) -> Path:
 
 
 @contextmanager
-def native_stderr() -> Iterator[list[str]]:
+def native_stderr(*, stdout: bool = False) -> Iterator[list[str]]:
     """Collect what C and C++ libraries print on stderr; the list is filled when the block ends.
 
+    Args:
+        stdout: collect what they print there, too; libjpeg inside of ITK does.
+
     Notes:
-        It redirects file descriptor 2 of the whole process, so only one thread at a time can be in such a block.
+        It redirects the file descriptors of the whole process, so only one thread at a time can be in such a block.
     """
     lines: list[str] = []
+    descriptors = (1, 2) if stdout else (2,)
     with _STDERR, tempfile.TemporaryFile() as sink:
+        sys.stdout.flush()
         sys.stderr.flush()
-        saved = os.dup(2)
-        os.dup2(sink.fileno(), 2)
+        saved = [os.dup(descriptor) for descriptor in descriptors]
+        for descriptor in descriptors:
+            os.dup2(sink.fileno(), descriptor)
         try:
             yield lines
         finally:
-            os.dup2(saved, 2)
-            os.close(saved)
+            for descriptor, before in zip(descriptors, saved, strict=True):
+                os.dup2(before, descriptor)
+                os.close(before)
             sink.seek(0)
             lines.extend(sink.read().decode(errors="replace").splitlines())

@@ -28,7 +28,7 @@ def isolated(
         arguments: of the function; they and the answer must allow pickling.
         path: the file that is read, for the sentence.
         size: bytes that are read; by default those of ``path``.
-        seconds: that it may take, beside a second for each megabyte; by default 30.
+        seconds: that it may take, 30 by default, and 1 more for each megabyte.
 
     Raises:
         InputError: the process died or took too long.
@@ -39,9 +39,9 @@ def isolated(
         memory than is free, and than a file of its size can ask for.
     """
     size = path.stat().st_size if size is None else size
-    seconds = (seconds or _SECONDS) + _PER_BYTE * size
+    seconds = (_SECONDS if seconds is None else seconds) + _PER_BYTE * size
     try:
-        return _worker(os.getpid()).call(_limited, _most(size), function, arguments, timeout=seconds)
+        return _worker(os.getpid()).call(_limited, Path.cwd(), _most(size), function, arguments, timeout=seconds)
     except WorkerLost as error:
         raise InputError(f"{path} makes its reader crash, so it {DAMAGED}") from error
     except TimeLimit as error:
@@ -62,8 +62,9 @@ def _most(size: int) -> int | None:
     return None if free is None else min(free, _LIBRARIES + _UNPACKED * size)
 
 
-def _limited(most: int | None, function: Callable[..., T], arguments: tuple[object, ...]) -> T:
-    """Call a function that may take no more than ``most`` bytes beside what the process has."""
+def _limited(folder: Path, most: int | None, function: Callable[..., T], arguments: tuple[object, ...]) -> T:
+    """Call a function in ``folder`` that may take no more than ``most`` bytes beside what the process has."""
+    os.chdir(folder)
     if most is not None:
         try:
             import resource

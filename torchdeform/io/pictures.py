@@ -17,7 +17,7 @@ from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import itk
 from torchdeform.io.files import native_stderr, read_head
-from torchdeform.io.gate import reading, require_room
+from torchdeform.io.gate import DAMAGED, reading, require_room
 
 UNREADABLE = "cannot be read as an image; it may be damaged: export it again"
 
@@ -61,6 +61,8 @@ def read_picture(path: Path) -> Image:
     with reading(path, UNREADABLE), _opened(path) as picture:
         _require_one(path, picture)
         form, orientation = picture.format or "", _orientation(picture)
+        if form in ("JPEG", "MPO"):
+            _require_end(path)
         image = _by_itk(path, _BY_ITK[form]) if form in _BY_ITK else None
         if image is None or image.grid.shape != picture.size[::-1]:
             with native_stderr():
@@ -121,6 +123,16 @@ def _require_one(path: Path, picture: Picture.Image) -> None:
     frames = getattr(picture, "n_frames", 1) if picture.format in _SEVERAL else 1
     if frames > 1:
         raise InputError(f"{path} is a series of {frames} pictures; save one of them and give that")
+
+
+def _require_end(path: Path) -> None:
+    """Raise `InputError` unless the end of a JPEG (FF D9) follows its last scan (FF DA): ITK makes up what is cut off.
+
+    Neither occurs inside coded pixels.
+    """
+    content = path.read_bytes()
+    if content.rfind(b"\xff\xd9") < content.rfind(b"\xff\xda"):
+        raise InputError(f"{path} {DAMAGED}")
 
 
 def _orientation(picture: Picture.Image) -> int:

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io.files import atomic_folder, suffix
-from torchdeform.io.validation import require_sound
+from torchdeform.io.gate import require_file
 
 _WORLD, _VOXEL = ("x", "y", "z"), ("i", "j", "k")
 _NAMES = ("name", "label", "landmark", "id", "index", "")
@@ -72,7 +72,7 @@ def read_points(path: _Path, image: Image | None = None, *, dim: int | None = No
             indices but without an image, or with points of another dimension.
     """
     file = Path(path)
-    require_sound(file)
+    require_file(file)
     if suffix(file) not in _READERS:
         raise InputError(f"{path} is no file of points; use one of {', '.join(_READERS)}")
     try:

@@ -16,7 +16,6 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.image import UNITS, Image
 from torchdeform.core.memory import available
 from torchdeform.errors import InputError
-from torchdeform.io.files import read_head
 from torchdeform.io.gate import CROP, DAMAGED, reading, require_beside, require_room
 from torchdeform.io.tiff_pixels import orientation_of, require_colours, shown, unpacked
 from torchdeform.io.tiff_scale import Scale, scale
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 
     Series = Sequence[TiffPageSeries]
 
-_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two with offsets of 64 bits (BigTIFF)
 _NAMES = {"px": "pixel", "µm": "micron"}  # of ImageJ, whose descriptions are in ASCII
 _DEPTH, _CHANNELS = "ZQI", "CS"  # letters of tifffile for axes: depth or unnamed pages; channels or samples
 _DAMAGE_SIGNS = (
@@ -43,11 +41,6 @@ _ASIDE = ("label", "macro", "thumbnail", "overview")  # names of images that are
 _REDUCED, _MASK = 1, 4  # bits of NewSubfileType
 _KEPT = 4  # bytes of a number of float32, which all become
 _TYPES = ("uint8", "uint16", "float32")  # of ImageJ
-
-
-def is_tiff(path: Path) -> bool:
-    """Return whether the content of a file starts like a TIFF, whatever its name: slides are TIFF too."""
-    return read_head(path, 4) in _STARTS
 
 
 def read_tiff(path: Path) -> Image:

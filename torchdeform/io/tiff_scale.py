@@ -89,9 +89,8 @@ def _slide(file: "TiffFile", page: "TiffPage") -> Scale | None:
         if kind in file.flags:
             packet = page.tags.valueof(_XMP, b"")
             text = page.description + (packet.decode(errors="replace") if isinstance(packet, bytes) else str(packet))
-            if found := pattern.search(text):
-                size = float(found[1]) * unit
-                return (1.0, size, size), "µm"
+            if sizes := [float(number) * unit for number in pattern.findall(text)]:
+                return (1.0, min(sizes), min(sizes)), "µm"  # smaller levels may be in it too
     return None
 
 

@@ -11,15 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Stage, Transform
 from torchdeform.errors import InputError
 from torchdeform.io import elastix, itk, itk_maps, matrices
 from torchdeform.io.files import atomic_folder, native_stderr, read_head, require_space, suffix
 from torchdeform.io.gate import require_file
-from torchdeform.io.maps import Field, Linear, Spline
-from torchdeform.io.validation import require_sound
+from torchdeform.io.maps import Linear, Spline
+from torchdeform.io.volume import Volume
+from torchdeform.io.warps import read_vectors
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
@@ -32,12 +32,8 @@ AFFINES = (".tfm", ".txt", ".mat")
 FIELDS = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd")
 
 
-# NIfTI's intents of warps that FSL writes: fields and coefficients.
-_FSL_INTENTS = ("2006", "2007", "2008", "2009")
 # Voxels around the domain of a spline that still belong to it.
 _NONE = 1e-6
-# Vectors that miss the places of their voxels by a smaller share of the places' spread are positions.
-_POSITIONS = 0.2
 
 
 def write_displacement(u: Tensor, fixed: Image, path: _Path) -> None:
@@ -72,50 +68,8 @@ def read_displacement(path: _Path) -> Image:
         The components may also stand on a fourth axis ``(x, y, z, 3)``, as arrays have them; they too are LPS mm.
     """
     file = Path(path)
-    require_sound(file)
-    try:
-        return _to_field(itk.to_image(_load_vectors(file), str(path)))
-    except RuntimeError as error:
-        raise InputError(f"{path} cannot be read ({itk.reason(error)}); it may be damaged: write it again") from error
-
-
-def _load_vectors(path: Path) -> "sitk.Image":
-    """Return an image of vectors, also one that keeps their components on a fourth axis."""
-    import SimpleITK as sitk
-
-    reader = sitk.ImageFileReader()
-    reader.SetFileName(str(path))
-    failed = itk.quietly(reader.ReadImageInformation) is not None
-    size = () if failed else reader.GetSize()
-    if len(size) != 4 or reader.GetNumberOfComponents() > 1 or size[3] != sum(n > 1 for n in size[:3]):
-        return itk.load(path)
-    code = reader.GetMetaData("intent_code") if reader.HasMetaDataKey("intent_code") else ""
-    if code in _FSL_INTENTS:
-        raise InputError(
-            f"{path} is a warp of FSL; convert it with `wb_command -convert-warpfield -from-fnirt {path.name} "
-            "moving.nii.gz -to-itk field.nii.gz`"
-        )
-    whole = itk.quietly(reader.Execute)
-    if isinstance(whole, RuntimeError):
-        raise whole
-    values = sitk.GetArrayFromImage(whole).reshape(size[::-1])
-    vectors = sitk.GetImageFromArray(np.ascontiguousarray(np.moveaxis(values, 0, -1)), isVector=True)
-    vectors.CopyInformation(whole[:, :, :, 0])
-    _require_displacements(vectors, path)
-    return vectors
-
-
-def _require_displacements(vectors: "sitk.Image", path: Path) -> None:
-    """Raise `InputError` if vectors are rather the positions that nodes go to, in LPS or RAS, than displacements."""
-    import SimpleITK as sitk
-
-    values = np.stack([sitk.GetArrayViewFromImage(vectors)[..., k].ravel() for k in range(2)])
-    grid = vectors.GetSize(), vectors.GetOrigin(), vectors.GetSpacing(), vectors.GetDirection()
-    places = sitk.GetArrayFromImage(sitk.PhysicalPointSource(sitk.sitkVectorFloat32, *grid))
-    there = np.stack([places[..., k].ravel() for k in range(2)])
-    for positions in (there, -there):
-        if np.std(values - positions) < _POSITIONS * np.std(positions):
-            raise InputError(f"{path} holds positions, not displacements; subtract from each voxel its place in LPS mm")
+    require_file(file, "displacement field")
+    return _to_field(itk.volume_image(read_vectors(file), str(path)))
 
 
 def voxel_displacement(u: Tensor, fixed: Image, moving: Image) -> Tensor:
@@ -237,14 +191,14 @@ def read_transform(path: _Path) -> Transform:
         Images go the other way than points.
     """
     file = Path(path)
-    require_file(file, "transform file")
+    require_file(file, "transform")
     if suffix(file) in FIELDS:
         field = read_displacement(file)
         return Transform((Displacement(replace(field, data=field.data.double())),))
     return Transform(tuple(_stage(part, str(path)) for part in _maps(file)))
 
 
-def _maps(path: Path) -> Sequence[Linear | Field | Spline]:
+def _maps(path: Path) -> Sequence[Linear | Spline | Volume]:
     """Return the maps of a file by its content: a text of elastix, a matrix, else what ITK reads."""
     head = read_head(path, 4096)
     if elastix.is_elastix(head):
@@ -255,26 +209,17 @@ def _maps(path: Path) -> Sequence[Linear | Field | Spline]:
     return itk_maps.read(path, known)
 
 
-def _stage(part: Linear | Field | Spline, name: str) -> Stage:
+def _stage(part: Linear | Spline | Volume, name: str) -> Stage:
     if isinstance(part, Linear):
         try:
             return Affine(torch.from_numpy(part.matrix), torch.from_numpy(part.offset))
         except InputError as error:
             raise InputError(f"{name} cannot be used: {error}; make it again") from error
-    if isinstance(part, Spline):  # it ends at its last nodes
-        return Displacement(_field_of(part.dense(name), name), margin=_NONE)
-    return Displacement(_field_of(part, name))
-
-
-def _field_of(field: Field, name: str) -> Image:
-    """Return a field as u in array order and units of spacing, float64."""
-    if not np.isfinite(field.vectors).all():
+    field = part.dense(name) if isinstance(part, Spline) else part
+    if not np.isfinite(field.values).all():
         raise InputError(f"{name} holds vectors that are not finite; make it again")
-    if min(field.vectors.shape[:-1]) < 2:
-        raise InputError(f"{name} has a field of a single node along an axis; make it again on two nodes at least")
-    grid = Grid(field.vectors.shape[:-1], tuple(map(float, field.spacing[::-1])))
-    data = torch.from_numpy(np.moveaxis(field.vectors, -1, 0).copy())[None]
-    return _to_field(Image(data, grid, tuple(field.origin), tuple(map(tuple, field.direction)), name))
+    u = _to_field(itk.volume_image(field, name, exact=True))
+    return Displacement(u, margin=_NONE) if isinstance(part, Spline) else Displacement(u)
 
 
 def _to_field(vectors: Image) -> Image:

@@ -98,7 +98,9 @@ def preflight(
         Images are compared on coarse grids and every voxel is read only for its value: less than a second at 128³.
     """
     settings = settings or RegistrationSettings()
+    given = [image for image in (fixed, moving, fixed_mask, moving_mask) if image is not None]
     found = [
+        *(Finding(WARNING, text) for image in given for text in image.remarks),
         *_check_values(fixed),
         *_check_values(moving),
         *_check_nodes(fixed, ERROR),
@@ -336,7 +338,7 @@ def _coarse(image: Image) -> Image:
         whole = grey.shape[axis] // block
         grey = grey.narrow(axis, 0, whole * block).unflatten(axis, (whole, block)).mean(axis + 1)
     first = [h * (block - 1) / 2 for h, block in zip(image.grid.spacing, blocks, strict=True)]
-    origin = image.to_world(torch.tensor(first, dtype=torch.float64).view(1, -1, 1)).flatten().tolist()
+    origin = image.to_world(torch.tensor(first, dtype=torch.float64, device="cpu").view(1, -1, 1)).flatten().tolist()
     spacing = tuple(h * block for h, block in zip(image.grid.spacing, blocks, strict=True))
     return replace(image, data=grey - background(grey), grid=Grid(tuple(grey.shape[2:]), spacing), origin=tuple(origin))
 

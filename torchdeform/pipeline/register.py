@@ -1,6 +1,5 @@
 """One pair of image files: reading and checking, registration, and the folder of results."""
 
-import json
 import re
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from torchdeform.io import read_image, write_displacement, write_image, write_tr
 from torchdeform.io.files import atomic_folder, require_writable
 from torchdeform.io.images import ending_like, read_labels, read_optional, require_storable, write_labels
 from torchdeform.io.points import matched, read_points
+from torchdeform.io.texts import read_json
 from torchdeform.metrics.evaluation import common_labels
 from torchdeform.pipeline.memory import fitting_grid, footprint
 from torchdeform.pipeline.preflight import WARNING, preflight
@@ -321,8 +321,8 @@ def _write_images(folder: Path, files: PairFiles, inputs: Inputs, result: Regist
 def _earlier_record(out: Path) -> dict[str, Any]:
     """Return the record that an earlier run left in ``out``; empty if there is none, or none that can be read."""
     try:
-        record = json.loads((out / RECORD).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        record = read_json(out / RECORD, "record of a registration")
+    except InputError:
         return {}
     return record if isinstance(record, dict) else {}
 

@@ -180,8 +180,8 @@ class PlacedImage:
 
 def moved(image: Image, affine: Affine) -> Image:
     """Return the image at the place where an affine map of the world takes it, pixel by pixel the same."""
-    corner = image.to_world(torch.zeros(1, image.grid.dim, 1, dtype=torch.float64))
-    direction = affine.matrix.double().cpu() @ torch.tensor(image.direction, dtype=torch.float64)
+    corner = image.to_world(torch.zeros(1, image.grid.dim, 1, dtype=torch.float64, device="cpu"))
+    direction = affine.matrix.double().cpu() @ torch.tensor(image.direction, dtype=torch.float64, device="cpu")
     return replace(
         image,
         origin=tuple(affine(corner).flatten().tolist()),

@@ -299,7 +299,7 @@ def _mean_affine(maps: Sequence[Transform], reference: Image, pose: Pose) -> Aff
     left, sizes, right = torch.linalg.svd(torch.stack([a.matrix.double().cpu() for a in affines]))
     logarithms = right.mT @ torch.diag_embed(sizes.log()) @ right
     matrix = torch.matrix_exp(logarithms.mean(0))
-    half = torch.tensor(reference.grid.extent, dtype=torch.float64).view(1, -1, 1) / 2
+    half = torch.tensor(reference.grid.extent, dtype=torch.float64, device="cpu").view(1, -1, 1) / 2
     middle = reference.to_world(half)
     goal = middle
     if pose == "mean":
@@ -320,7 +320,8 @@ def average_intensities(images: Iterable[Image], *, match: bool = True) -> Image
     Raises:
         InputError: no image, or shapes that do not agree.
     """
-    total, count, levels, first = torch.zeros(()), torch.zeros(()), [], None
+    total = count = torch.zeros((), dtype=torch.float32, device="cpu")
+    levels, first = [], None
     for image in images:
         first = first or image
         if image.data.shape != first.data.shape:

@@ -50,7 +50,7 @@ def open_dask(settings: EngineSettings, jobs: Sequence[Job], logs: Path) -> Iter
         import distributed
     except ImportError as error:
         raise InputError("engine kind dask needs Dask: pip install 'torchdeform[dask]'") from error
-    needs = dict(zip((job.name for job in jobs), _measured(jobs), strict=True))
+    needs = dict(zip((job.name for job in jobs), measure(jobs), strict=True))
     with ExitStack() as stack:
         cluster = settings.cluster
         where = settings.scheduler if cluster is None else stack.enter_context(start(cluster, logs))
@@ -95,15 +95,6 @@ def _share() -> int:
     from distributed import get_worker
 
     return max(1, usable_cores() // get_worker().state.nthreads)
-
-
-def _measured(jobs: Sequence[Job]) -> list[int]:
-    """Return the memory of pairs, measured in another process because that loads ITK."""
-    helper = Worker()
-    try:
-        return helper.call(measure, jobs)
-    finally:
-        helper.stop()
 
 
 def _connect(kind: "type[Client]", where: Any) -> "Client":

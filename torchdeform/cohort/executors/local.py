@@ -113,11 +113,7 @@ class LocalExecutor(Executor):
 def open_local(settings: EngineSettings, jobs: Sequence[Job]) -> Iterator[Engine]:
     """Yield the engine of this machine for these jobs. Its processes end with the block."""
     gpus = visible_gpus() if any(job.device != "cpu" for job in jobs) else []
-    first = Worker(environment(0, gpus=gpus))
-    try:
-        count = settings.workers if settings.workers != "auto" else _fitting(first.call(measure, jobs), gpus)
-    finally:
-        first.stop()
+    count = settings.workers if settings.workers != "auto" else _fitting(measure(jobs), gpus)
     threads = settings.threads if settings.threads != "auto" else max(1, usable_cores() // count)
     workers = [Worker(environment(threads, slot=slot, gpus=gpus)) for slot in range(min(count, len(jobs)))]
     executor = LocalExecutor(workers, settings.timeout)

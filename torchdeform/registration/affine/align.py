@@ -111,7 +111,7 @@ def align(
         found = search(objectives[0], kind, turn=turn, steps=settings.steps)
         if abs(math.log(found.size)) > math.log(_SAME_SIZE):
             objectives = _make_objectives(*pair, frame, settings, found.size)
-    identity = torch.eye(fixed.grid.dim + 1, dtype=torch.float64)
+    identity = torch.eye(fixed.grid.dim + 1, dtype=torch.float64, device="cpu")
     before = Candidate("geometry", identity, float(objectives[-1].values(identity.unsqueeze(0))[0]))
     best = before
     if kind != "none":

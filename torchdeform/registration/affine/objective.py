@@ -53,7 +53,9 @@ class MaskedImage:
         last = [min(n - 1, int(high) + margin) for high, n in zip(places.amax(0), grid.shape, strict=True)]
         cut = (slice(None), slice(None), *(slice(a, b + 1) for a, b in zip(first, last, strict=True)))
         shape = tuple(b - a + 1 for a, b in zip(first, last, strict=True))
-        corner = torch.tensor([a * h for a, h in zip(first, grid.spacing, strict=True)], dtype=torch.float64)
+        corner = torch.tensor(
+            [a * h for a, h in zip(first, grid.spacing, strict=True)], dtype=torch.float64, device="cpu"
+        )
         origin = tuple(self.image.to_world(corner.view(1, -1, 1)).flatten().tolist())
         image = replace(self.image, data=self.image.data[cut], grid=Grid(shape, grid.spacing), origin=origin)
         return MaskedImage(image, self.weight[cut])
@@ -79,7 +81,7 @@ class NormalisedFrame:
     def to_grid(self, image: Image) -> Tensor:
         """Return the matrix ``(D + 1, D + 1)`` that takes [q; 1] to grid points of the image."""
         dim = len(self.centre)
-        ends = torch.eye(dim, dim + 1, dtype=torch.float64).unsqueeze(0)
+        ends = torch.eye(dim, dim + 1, dtype=torch.float64, device="cpu").unsqueeze(0)
         places = image.to_grid(self.centre.view(1, -1, 1) + self.radius * ends)[0]
         return homogeneous(places[:, :dim] - places[:, dim:], places[:, dim])
 
@@ -161,7 +163,8 @@ class AffineObjective:
         rows = (slopes.unsqueeze(3) * self.points).flatten(2, 3) * weight.flatten(2).sqrt().unsqueeze(1)
         image = (rows @ rows.transpose(2, 3)).sum(1).double().cpu() / self.points.shape[1]
         points = self.points.double().cpu()
-        plain = torch.kron(torch.eye(len(points) - 1).double(), points @ points.T / points.shape[1])
+        single = torch.eye(len(points) - 1, dtype=torch.float64, device="cpu")
+        plain = torch.kron(single, points @ points.T / points.shape[1])
         size = torch.diagonal(image, dim1=1, dim2=2).sum(1).clamp(min=1e-12) / torch.trace(plain)
         return image + _DAMPING * size.view(-1, 1, 1) * plain
 

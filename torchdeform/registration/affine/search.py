@@ -206,7 +206,7 @@ def make_starts(fixed: Moments, moving: Moments, *, turn: bool, scale: bool, mir
         "mass": (fixed.mass, moving.mass),
     }
     turns = rotations(len(fixed.box)) if turn else rotations(len(fixed.box))[:1]
-    flip = torch.ones(len(fixed.box), dtype=torch.float64)
+    flip = torch.ones(len(fixed.box), dtype=torch.float64, device="cpu")
     flip[0] = -1.0 if mirror else 1.0
     found = []
     for (name, (start, end)), size, r in itertools.product(anchors.items(), sizes, turns):
@@ -227,5 +227,5 @@ def _axes(fixed: Moments, moving: Moments) -> list[Tensor]:
     """Return the rotations that take principal axes to principal axes: 2 in 2D, 4 in 3D."""
     frames = [torch.linalg.eigh(b.covariance).eigenvectors for b in (fixed, moving)]
     signs = itertools.product((1.0, -1.0), repeat=len(fixed.box))
-    every = [frames[1] @ torch.diag(torch.tensor(s, dtype=torch.float64)) @ frames[0].T for s in signs]
+    every = [frames[1] @ torch.diag(torch.tensor(s, dtype=torch.float64, device="cpu")) @ frames[0].T for s in signs]
     return [r for r in every if torch.linalg.det(r) > 0]

@@ -1,0 +1,26 @@
+"""Pixels that ITK reads in another process."""
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+
+from torchdeform.io.isolated import isolated
+from torchdeform.io.itk_pixels import itk_pixels
+
+
+def test_pixels_are_those_of_itk(tmp_path):
+    values = np.random.default_rng(0).integers(0, 65535, (20, 30)).astype(np.uint16)
+    sitk.WriteImage(sitk.GetImageFromArray(values), str(tmp_path / "a.tif"), True)
+    path = tmp_path / "a.tif"
+    assert np.array_equal(itk_pixels(str(path)), values)
+    assert np.array_equal(isolated(itk_pixels, str(path), path=path), values)
+
+
+def test_what_is_made_up_is_an_error(tmp_path, capfd):
+    values = np.random.default_rng(0).integers(0, 65535, (400, 300)).astype(np.uint16)
+    sitk.WriteImage(sitk.GetImageFromArray(values), str(tmp_path / "a.tif"))
+    content = (tmp_path / "a.tif").read_bytes()
+    (tmp_path / "a.tif").write_bytes(content[: len(content) // 2])
+    with pytest.raises((RuntimeError, ValueError)):
+        itk_pixels(str(tmp_path / "a.tif"))
+    assert capfd.readouterr() == ("", "")
