@@ -46,6 +46,13 @@ def test_it_gets_no_more_memory_than_is_free(file, monkeypatch):
     assert len(isolated(bytes, 10**6, path=file)) == 10**6
 
 
+def test_it_gets_no_more_memory_than_its_file_can_ask_for(file, monkeypatch):
+    monkeypatch.setattr(module, "available", lambda: 10**12)
+    with pytest.raises(MemoryError):
+        isolated(bytes, 3 * 10**9, path=file)
+    assert len(isolated(bytes, 10**6, path=file)) == 10**6
+
+
 def test_it_needs_no_torch(file):
     code = "import sys; assert 'torch' not in sys.modules"
     assert isolated(exec, code, path=file) is None

@@ -69,7 +69,7 @@ def lost_output() -> str:
     """Return why the file that standard output goes to lacks something, empty if it is whole."""
     sys.stdout.flush()
     raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
-    return raw.lost if isinstance(raw, _Stream) else ""
+    return (raw.lost or "") if isinstance(raw, _Stream) else ""
 
 
 @contextmanager

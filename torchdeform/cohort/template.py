@@ -197,7 +197,8 @@ def _read_map(current: Round, subject: Subject, reference: Image) -> Transform:
     pair = current.folder / _PAIRS / subject.name
     forward, back = (read_transform(pair / name).stages for name in (_TRANSFORM, _INVERSE))
     fields = [stage.field for stage in (forward[0], back[-1]) if isinstance(stage, Displacement)]
-    known = Displacement(*(replace(field, data=field.data.float()) for field in fields))
+    first, second = (replace(field, data=field.data.float()) for field in fields)
+    known = Displacement(first, second)
     return Transform((known, *forward[1:]), reference).to(reference.data.device)
 
 

@@ -4,7 +4,6 @@ A slice is a file or a frame of an enhanced file: both go through the same check
 """
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from dataclasses import replace
 from itertools import groupby, pairwise
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from torchdeform.io import itk
 from torchdeform.io.dicom_header import DCM2NIIX, Slice, is_dicom, no_image, slices
 from torchdeform.io.dicom_pixels import pixels
 from torchdeform.io.gate import DAMAGED
-from torchdeform.io.volume import NOT_FINITE
+from torchdeform.io.volume import NOT_FINITE, Volume
 
 # A file is read as its whole series when that has so many slices. With fewer it cannot be registered as a volume.
 VOLUME_SLICES = 8
@@ -191,17 +190,10 @@ def _repeats(series: Sequence[Slice]) -> bool:
 
 def _image(slices: Sequence[Slice], name: str) -> Image:
     """Return the pixels of sorted slices in their place. The third axis of a volume is the normal of its slices."""
-    import SimpleITK as sitk
-
     step = _require_regular(slices, name) if len(slices) > 1 else 1.0
-    values, first = _values(slices, name), slices[0]
-    grey = values.shape[-1] == 1
-    loaded = sitk.GetImageFromArray(values[..., 0] if grey else values, isVector=not grey)
-    loaded.SetOrigin(first.position.tolist())
-    loaded.SetDirection(first.axes.ravel().tolist())
-    loaded.SetSpacing((*(first.spacing or (1.0, 1.0)), step))
-    image = itk.to_image(loaded, name)
-    return image if first.spacing else replace(image, unit="px")
+    first, unit = slices[0], "px" if slices[0].spacing is None else "mm"
+    spacing = (*(first.spacing or (1.0, 1.0)), step)
+    return itk.volume_image(Volume(_values(slices, name), spacing, tuple(first.position), first.axes, unit), name)
 
 
 def _values(slices: Sequence[Slice], name: str) -> NDArray[np.generic]:

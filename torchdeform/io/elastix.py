@@ -3,18 +3,21 @@
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
 from torchdeform.errors import InputError
-from torchdeform.io.gate import read_text
+from torchdeform.io.gate import read_text, reading
 from torchdeform.io.maps import Linear, Numbers, Spline
+from torchdeform.io.volume import Volume
 
 _ENTRY = re.compile(r"\((\w+)\s(.*)\)\s*(?://.*)?")
 _VALUE = re.compile(r'"([^"]*)"|([^\s"]+)')
 _START = re.compile(rb"\s*(//[^\n]*\n\s*)*\(\w+[ \t]")
 _INITIAL = ("InitialTransformParameterFileName", "InitialTransformParametersFileName")
+_INCOMPLETE = "lacks values of its transform, or has some that do not fit; write it again"
 _LONGEST = 32  # files that build on each other
 
 _ADVICE = "run `transformix -def all -tp {} -out folder` and give its deformationField"
@@ -40,11 +43,9 @@ def _read(path: Path, above: tuple[Path, ...]) -> list[Linear | Spline]:
     if path in above or len(above) > _LONGEST:
         raise InputError(f"{path} builds on itself; correct its InitialTransformParametersFileName")
     entries = _parse(path)
-    name = next((entries[key][0] for key in _INITIAL if entries.get(key)), "NoInitialTransform")
-    try:
+    with reading(path, _INCOMPLETE):
         own = _map(path, entries)
-    except (KeyError, IndexError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} lacks values of its transform ({error}); write it again") from error
+    name = next((entries[key][0] for key in _INITIAL if entries.get(key)), "NoInitialTransform")
     if name == "NoInitialTransform":
         return [own]
     before = _read(_beside(path, name), (*above, path))
@@ -76,8 +77,9 @@ def _combined(path: Path, before: list[Linear | Spline], own: Linear | Spline, h
     if how == "Add" and len(before) == 1 and isinstance(first := before[0], Linear):
         if isinstance(own, Linear):
             return [Linear(first.matrix + own.matrix - np.eye(len(own.offset)), first.offset + own.offset)]
-        moved = np.einsum("ij,...j->...i", np.linalg.inv(first.matrix), own.vectors)  # A x + b = A (x + A⁻¹ b)
-        return [Spline(moved, own.origin, own.spacing, own.direction, own.order), first]
+        mesh = own.coefficients
+        moved = mesh.values.astype(np.float64) @ np.linalg.inv(first.matrix).T  # A x + b = A (x + A⁻¹ b)
+        return [replace(own, coefficients=replace(mesh, values=moved)), first]
     raise InputError(f"{path} combines transforms by '{how}', which cannot be read here; {_ADVICE.format(path.name)}")
 
 
@@ -159,7 +161,8 @@ def _spline(entries: Entries, p: Numbers, dim: int) -> Spline:
     if min(size) < 1 or math.prod(size) * dim != len(p) or order not in (1, 2, 3):
         raise ValueError("GridSize")
     vectors = np.moveaxis(p.reshape(dim, *size[::-1]), 0, -1)
-    return Spline(vectors, origin + direction @ (spacing * index), spacing, direction, order)
+    start = origin + direction @ (spacing * index)
+    return Spline(Volume(vectors, tuple(spacing), tuple(start), direction), order)
 
 
 _KINDS: dict[str, Callable[[Entries, Numbers, int], Linear | Spline]] = {

@@ -15,6 +15,7 @@ from torchdeform.io.gate import DAMAGED
 T = TypeVar("T")
 
 _SECONDS, _PER_BYTE = 30.0, 1e-6  # that a reader may take, and more for each byte of the file
+_LIBRARIES, _UNPACKED = 2_000_000_000, 1100  # bytes of addresses for what it loads, and for each byte of the file
 
 
 def isolated(
@@ -35,11 +36,12 @@ def isolated(
 
     Notes:
         The process starts with the first call (0.3 s), is kept for the next, and ends with this one. It gets no more
-        memory than is free.
+        memory than is free, and than a file of its size can ask for.
     """
-    seconds = (seconds or _SECONDS) + _PER_BYTE * (path.stat().st_size if size is None else size)
+    size = path.stat().st_size if size is None else size
+    seconds = (_SECONDS if seconds is None else seconds) + _PER_BYTE * size
     try:
-        return _worker(os.getpid()).call(_limited, Path.cwd(), available(), function, arguments, timeout=seconds)
+        return _worker(os.getpid()).call(_limited, Path.cwd(), _most(size), function, arguments, timeout=seconds)
     except WorkerLost as error:
         raise InputError(f"{path} makes its reader crash, so it {DAMAGED}") from error
     except TimeLimit as error:
@@ -52,6 +54,12 @@ def _worker(_process: int) -> Worker:
     worker = Worker()
     atexit.register(worker.stop)
     return worker
+
+
+def _most(size: int) -> int | None:
+    """Return how many bytes reading a file of ``size`` bytes may take, None where no limit is known."""
+    free = available()
+    return None if free is None else min(free, _LIBRARIES + _UNPACKED * size)
 
 
 def _limited(folder: Path, most: int | None, function: Callable[..., T], arguments: tuple[object, ...]) -> T:

@@ -11,7 +11,9 @@ from torchdeform.errors import InputError
 from torchdeform.io.files import native_stderr
 from torchdeform.io.gate import DAMAGED
 from torchdeform.io.isolated import isolated
-from torchdeform.io.maps import Field, Linear, Spline, to_field
+from torchdeform.io.loading import volume_of
+from torchdeform.io.maps import Linear, Spline, to_field
+from torchdeform.io.volume import Volume
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
@@ -24,7 +26,7 @@ _UNKNOWN = re.compile(r"create an instance of ['\"]?(\w+)")
 _GRIDS = ("BSpline", "DisplacementField")  # transforms whose first fixed parameters are the size of a grid
 
 
-def read(path: Path, known: str) -> list[Linear | Field | Spline]:
+def read(path: Path, known: str) -> list[Linear | Spline | Volume]:
     """Return the maps of a file in the order in which points go through them.
 
     Args:
@@ -37,7 +39,7 @@ def read(path: Path, known: str) -> list[Linear | Field | Spline]:
     return isolated(_read, path, known, path=path)
 
 
-def _read(path: Path, known: str) -> list[Linear | Field | Spline]:
+def _read(path: Path, known: str) -> list[Linear | Spline | Volume]:
     import SimpleITK as sitk
 
     if path.suffix.lower() in _TEXT:
@@ -68,7 +70,7 @@ def _require_grids(path: Path) -> None:
                 raise InputError(f"{path} {DAMAGED}")
 
 
-def _maps(transform: "sitk.Transform", name: str) -> list[Linear | Field | Spline]:
+def _maps(transform: "sitk.Transform", name: str) -> list[Linear | Spline | Volume]:
     """Return the parts of ITK's transform in the order in which they are applied; ITK stores the reverse."""
     import SimpleITK as sitk
 
@@ -79,18 +81,10 @@ def _maps(transform: "sitk.Transform", name: str) -> list[Linear | Field | Splin
         parts = [transform.GetNthTransform(k) for k in reversed(range(transform.GetNumberOfTransforms()))]
         return [found for part in parts for found in _maps(part, name)]
     if isinstance(transform, sitk.DisplacementFieldTransform):
-        field = transform.GetDisplacementField()
-        return [Field(sitk.GetArrayFromImage(field).astype(np.float64), *_place(field))]
+        return [volume_of(transform.GetDisplacementField())]
     if isinstance(transform, sitk.BSplineTransform):
-        images = transform.GetCoefficientImages()
-        coefficients = np.stack([sitk.GetArrayFromImage(image) for image in images], axis=-1)
-        return [Spline(coefficients, *_place(images[0]), transform.GetOrder())]
+        return [Spline(volume_of(sitk.Compose(transform.GetCoefficientImages())), transform.GetOrder())]
     raise InputError(f"{name} holds a {transform.GetName()}, which cannot be read here; {to_field(name)}")
-
-
-def _place(image: "sitk.Image") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    dim = image.GetDimension()
-    return np.array(image.GetOrigin()), np.array(image.GetSpacing()), np.reshape(image.GetDirection(), (dim, dim))
 
 
 def _linear(transform: "sitk.Transform") -> Linear:

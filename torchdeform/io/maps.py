@@ -1,4 +1,4 @@
-"""Maps of the world as plain numbers, as files hold them: linear maps, fields of vectors and B-splines, LPS mm."""
+"""Maps of the world as plain numbers, as files hold them: linear maps and B-splines; fields are volumes. LPS mm."""
 
 import math
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchdeform.errors import InputError
+from torchdeform.io.volume import Volume
 
 Numbers = NDArray[np.float64]
 
@@ -34,42 +35,19 @@ class Linear:
 
 
 @dataclass(frozen=True)
-class Field:
-    """x ↦ x + d(x), d between the nodes of a grid, 0 outside.
-
-    Attributes:
-        vectors: ``(*S, D)``, array order (z, y, x), vectors (x, y, z) in mm.
-        origin: of node 0, mm.
-        spacing: along x, y, z, mm.
-        direction: columns are the directions of the grid's x, y, z.
-    """
-
-    vectors: Numbers
-    origin: Numbers
-    spacing: Numbers
-    direction: Numbers
-
-
-@dataclass(frozen=True)
 class Spline:
     """x ↦ x + Σ c_j β(x/h − j), 0 where not all of the B-splines are there.
 
     Attributes:
-        vectors: coefficients c ``(*S, D)``, as those of a `Field`.
-        origin: of coefficient 0, mm.
-        spacing: of the mesh h along x, y, z, mm.
-        direction: as that of a `Field`.
+        coefficients: c as vectors (x, y, z) in mm, on a mesh of spacing h.
         order: of the B-splines, 1 to 3.
     """
 
-    vectors: Numbers
-    origin: Numbers
-    spacing: Numbers
-    direction: Numbers
+    coefficients: Volume
     order: int = 3
 
-    def dense(self, name: str) -> Field:
-        """Return the spline as a field on its own domain, fine enough that its linear interpolation is close.
+    def dense(self, name: str) -> Volume:
+        """Return the spline as vectors on its own domain, so fine that their linear interpolation is close.
 
         Args:
             name: the file, for the sentence.
@@ -81,29 +59,33 @@ class Spline:
             The error of linear interpolation is at most Σ_a (h_a²/8) |∂²d/∂x_a²|, and the second derivatives of a
             spline are no larger than the second differences of its coefficients.
         """
-        shape = np.array(self.vectors.shape[:-1])
-        if not np.isfinite(self.vectors).all() or min(shape) <= self.order:
-            raise InputError(f"{name} holds a B-spline without a domain or with numbers that are not finite")
-        cell = float(min(self.spacing))
-        cuts = self._cuts(min(_CLOSE, _SHARE * cell))
-        if math.prod((shape - self.order) * cuts + 1) > _NODES:
-            cuts = self._cuts(_SHARE * cell)
-        if math.prod(nodes := (shape - self.order) * cuts + 1) > _NODES:
+        mesh = self.coefficients
+        values, spacing = mesh.values.astype(np.float64), np.array(mesh.spacing)
+        if not np.isfinite(values).all() or min(mesh.size) <= self.order or self.order < 1:
+            raise InputError(f"{name} holds a B-spline that is stepped, has no domain or numbers that are not finite")
+        cell = float(min(spacing))
+        cuts = self._cuts(values, min(_CLOSE, _SHARE * cell))
+        if self._nodes(cuts) > _NODES:
+            cuts = self._cuts(values, _SHARE * cell)
+        if self._nodes(cuts) > _NODES:
             raise InputError(f"{name} holds a B-spline that is too rough for a field; {to_field(name)}")
-        values = self.vectors
-        for axis, (count, cut) in enumerate(zip(shape, cuts, strict=True)):
-            weights = _weights(int(count), self.order, int(cut))
+        for axis, cut in enumerate(cuts):
+            weights = _weights(values.shape[axis], self.order, cut)
             values = np.moveaxis(np.tensordot(weights, values, axes=(1, axis)), 0, axis)
-        start = np.full(len(nodes), (self.order - 1) / 2)
-        origin = self.origin + self.direction @ (self.spacing * start)
-        return Field(np.ascontiguousarray(values), origin, self.spacing / cuts[::-1], self.direction)
+        start = np.array(mesh.origin) + mesh.direction @ (spacing * (self.order - 1) / 2)
+        return Volume(values, tuple(spacing / cuts[::-1]), tuple(start), mesh.direction)
 
-    def _cuts(self, error: float) -> NDArray[np.int64]:
+    def _cuts(self, values: Numbers, error: float) -> list[int]:
         """Return into how many parts a cell must be cut along each array axis."""
-        axes = range(self.vectors.ndim - 1)
-        bends = [np.linalg.norm(np.diff(self.vectors, 2, axis), axis=-1).max(initial=0.0) for axis in axes]
+        axes = range(values.ndim - 1)
+        with np.errstate(over="ignore"):  # then there are too many nodes
+            bends = [np.linalg.norm(np.diff(values, 2, axis), axis=-1).max(initial=0.0) for axis in axes]
         wanted = np.sqrt(len(bends) * np.array(bends) / (8 * error)) * (self.order > 1)
-        return np.clip(np.ceil(wanted), 1, _NODES).astype(np.int64)
+        return np.clip(np.ceil(wanted), 1, _NODES).astype(int).tolist()
+
+    def _nodes(self, cuts: list[int]) -> int:
+        counts = self.coefficients.size[::-1]
+        return math.prod((count - self.order) * cut + 1 for count, cut in zip(counts, cuts, strict=True))
 
 
 def _weights(count: int, order: int, cuts: int) -> Numbers:

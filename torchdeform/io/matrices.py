@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from torchdeform.errors import InputError
-from torchdeform.io.gate import DAMAGED, read_text
+from torchdeform.io.gate import read_text, reading
 from torchdeform.io.maps import Linear, Numbers
 
 _LONGEST = 4096  # bytes of a bare matrix
@@ -32,10 +32,8 @@ def read(path: Path) -> list[Linear]:
         images. An LTA takes moving (src) to fixed (dst) points.
     """
     text = read_text(path, "transform file")
-    try:
+    with reading(path):
         ras = _of_lta(path, text) if _LTA.search(text.encode()) else _of_rows(path, text)
-    except (ValueError, KeyError, IndexError, np.linalg.LinAlgError) as error:
-        raise InputError(f"{path} {DAMAGED}") from error
     flip = np.ones(len(ras))
     flip[:2] = -1
     lps = flip[:, None] * ras * flip

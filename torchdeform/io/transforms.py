@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Stage, Transform
 from torchdeform.errors import InputError
@@ -19,9 +18,9 @@ from torchdeform.io import elastix, itk, itk_maps, matrices
 from torchdeform.io.files import atomic_folder, native_stderr, read_head, require_space, suffix
 from torchdeform.io.gate import require_file
 from torchdeform.io.loading import reason
-from torchdeform.io.maps import Field, Linear, Spline
+from torchdeform.io.maps import Linear, Spline
 from torchdeform.io.volume import Volume
-from torchdeform.io.volumes import read_volume
+from torchdeform.io.warps import read_vectors
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
@@ -34,12 +33,8 @@ AFFINES = (".tfm", ".txt", ".mat")
 FIELDS = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd")
 
 
-# NIfTI's intents of warps that FSL writes: fields and coefficients.
-_FSL_INTENTS = (2006, 2007, 2008, 2009)
 # Voxels around the domain of a spline that still belong to it.
 _NONE = 1e-6
-# Vectors that miss the places of their voxels by a smaller share of the places' spread are positions.
-_POSITIONS = 0.2
 
 
 def write_displacement(u: Tensor, fixed: Image, path: _Path) -> None:
@@ -75,25 +70,7 @@ def read_displacement(path: _Path) -> Image:
     """
     file = Path(path)
     require_file(file, "displacement field")
-    volume = read_volume(file, vectors=True)
-    if volume.intent in _FSL_INTENTS:
-        raise InputError(
-            f"{path} is a warp of FSL; convert it with `wb_command -convert-warpfield -from-fnirt {file.name} "
-            "moving.nii.gz -to-itk field.nii.gz`"
-        )
-    if volume.stacked:
-        _require_displacements(volume, file)
-    return _to_field(itk.volume_image(volume, str(path)))
-
-
-def _require_displacements(volume: Volume, path: Path) -> None:
-    """Raise `InputError` if vectors are rather the positions that nodes go to, in LPS or RAS, than displacements."""
-    index = np.stack(np.meshgrid(*map(np.arange, volume.size), indexing="ij"), axis=-1) * volume.spacing
-    places = index @ volume.direction.T + volume.origin
-    values = volume.values.swapaxes(0, -2)[..., :2].astype(np.float64)
-    for positions in (places[..., :2], -places[..., :2]):
-        if np.std(values - positions) < _POSITIONS * np.std(positions):
-            raise InputError(f"{path} holds positions, not displacements; subtract from each voxel its place in LPS mm")
+    return _to_field(itk.volume_image(read_vectors(file), str(path)))
 
 
 def voxel_displacement(u: Tensor, fixed: Image, moving: Image) -> Tensor:
@@ -215,14 +192,14 @@ def read_transform(path: _Path) -> Transform:
         Images go the other way than points.
     """
     file = Path(path)
-    require_file(file, "transform file")
+    require_file(file, "transform")
     if suffix(file) in FIELDS:
         field = read_displacement(file)
         return Transform((Displacement(replace(field, data=field.data.double())),))
     return Transform(tuple(_stage(part, str(path)) for part in _maps(file)))
 
 
-def _maps(path: Path) -> Sequence[Linear | Field | Spline]:
+def _maps(path: Path) -> Sequence[Linear | Spline | Volume]:
     """Return the maps of a file by its content: a text of elastix, a matrix, else what ITK reads."""
     head = read_head(path, 4096)
     if elastix.is_elastix(head):
@@ -233,26 +210,17 @@ def _maps(path: Path) -> Sequence[Linear | Field | Spline]:
     return itk_maps.read(path, known)
 
 
-def _stage(part: Linear | Field | Spline, name: str) -> Stage:
+def _stage(part: Linear | Spline | Volume, name: str) -> Stage:
     if isinstance(part, Linear):
         try:
             return Affine(torch.from_numpy(part.matrix), torch.from_numpy(part.offset))
         except InputError as error:
             raise InputError(f"{name} cannot be used: {error}; make it again") from error
-    if isinstance(part, Spline):  # it ends at its last nodes
-        return Displacement(_field_of(part.dense(name), name), margin=_NONE)
-    return Displacement(_field_of(part, name))
-
-
-def _field_of(field: Field, name: str) -> Image:
-    """Return a field as u in array order and units of spacing, float64."""
-    if not np.isfinite(field.vectors).all():
+    field = part.dense(name) if isinstance(part, Spline) else part
+    if not np.isfinite(field.values).all():
         raise InputError(f"{name} holds vectors that are not finite; make it again")
-    if min(field.vectors.shape[:-1]) < 2:
-        raise InputError(f"{name} has a field of a single node along an axis; make it again on two nodes at least")
-    grid = Grid(field.vectors.shape[:-1], tuple(map(float, field.spacing[::-1])))
-    data = torch.from_numpy(np.moveaxis(field.vectors, -1, 0).copy())[None]
-    return _to_field(Image(data, grid, tuple(field.origin), tuple(map(tuple, field.direction)), name))
+    u = _to_field(itk.volume_image(field, name, exact=True))
+    return Displacement(u, margin=_NONE) if isinstance(part, Spline) else Displacement(u)
 
 
 def _to_field(vectors: Image) -> Image:

@@ -100,7 +100,7 @@ class MeanShape:
 
     def recentred(self, from_reference: Transform) -> Transform:
         """Return φ ∘ M⁻¹, from the template to an image, for φ from the reference to that image."""
-        back = Displacement(*(replace(self.place, data=u) for u in (self.inverse, self.displacement)))
+        back = Displacement(replace(self.place, data=self.inverse), replace(self.place, data=self.displacement))
         first = () if self.affine is None else (self.affine.inverse(),)
         return Transform((*first, back, *from_reference.stages), self.place, from_reference.moving)
 
