@@ -17,7 +17,6 @@ from torchdeform.metrics.base import weighted
 from torchdeform.metrics.similarity import needs_common_scale
 from torchdeform.registration.settings import RegistrationSettings
 
-
 # Slices are far apart where they are so many times farther than the nodes and the pixels.
 _SPARSE = 3.0
 

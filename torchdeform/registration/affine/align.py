@@ -41,6 +41,9 @@ _LITTLE_OVERLAP = 0.5
 _LENGTH_FACTORS = (0.5, 2.0)
 
 
+_NOTHING = SearchResult([])
+
+
 @dataclass(frozen=True)
 class Alignment:
     """The map that aligns two images.
@@ -99,8 +102,8 @@ def align(
         rotations all around (36 in 2D, the 60 of the icosahedron in 3D), on a grid of some 4000 nodes. The best are
         optimised by BFGS on the group of maps, coarse to fine. The files' geometry is tried again on the second level,
         and is the result if nothing is more similar. Where fields of view or voxels differ much in size, several sizes
-        are tried, see `guessed`, and all places of the smaller image in the larger one. The map depends on the world positions of the voxels, not on the
-        order of the axes in the file. Determinants are positive: maps are rotations times exponentials.
+        are tried, see `guessed`, and all places of the smaller image in the larger one. The map depends on the world
+        positions of the voxels, not on the order of the axes in the file. Determinants are positive: maps are rotations times exponentials.
         Runs on the images' device, in float32; not differentiable, but `Transform.image` is, in the map and the pixels.
     """
     settings, began = settings or AlignmentSettings(), perf_counter()
@@ -136,7 +139,7 @@ class _Trial:
     guess: Guess
     frame: NormalisedFrame
     levels: list[tuple[MaskedImage, MaskedImage]]
-    found: SearchResult = SearchResult([])
+    found: SearchResult = _NOTHING
 
     def objectives(self, settings: AlignmentSettings) -> list[AffineObjective]:
         """Return those of all levels, coarse to fine, both images blurred alike by the best map."""

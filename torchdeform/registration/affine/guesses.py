@@ -3,8 +3,6 @@
 import math
 from dataclasses import dataclass
 
-import torch
-
 from torchdeform.registration.affine.objective import MaskedImage, NormalisedFrame
 from torchdeform.registration.affine.search import contents_ratio, image_moments
 
