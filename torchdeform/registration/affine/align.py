@@ -103,7 +103,8 @@ def align(
         optimised by BFGS on the group of maps, coarse to fine. The files' geometry is tried again on the second level,
         and is the result if nothing is more similar. Where fields of view or voxels differ much in size, several sizes
         are tried, see `guessed`, and all places of the smaller image in the larger one. The map depends on the world
-        positions of the voxels, not on the order of the axes in the file. Determinants are positive: maps are rotations times exponentials.
+        positions of the voxels, not on the order of the axes in the file. Determinants are positive: maps are rotations
+        times exponentials.
         Runs on the images' device, in float32; not differentiable, but `Transform.image` is, in the map and the pixels.
     """
     settings, began = settings or AlignmentSettings(), perf_counter()
