@@ -14,6 +14,7 @@ from torch.autograd import gradcheck, gradgradcheck
 from torchdeform.core import grid as module
 from torchdeform.core.derivatives import (
     KERNELS,
+    add_adjoint_derivative,
     by_slabs,
     cofactors,
     curl,
@@ -178,6 +179,16 @@ def test_slabs_do_not_show(shape, monkeypatch):
     u = random_field(grid, len(shape), items=2)
     for function in (jacobian_determinant, divergence, lambda u, g: map_jacobian(u, g).flatten(1, 2)):
         assert torch.equal(by_slabs(function, u, grid), function(u, grid))
+
+
+def test_two_nodes_have_one_difference():
+    grid = Grid((2, 5), (0.5, 1.0))
+    x, y = torch.rand(2, 1, 1, 2, 5, dtype=torch.float64)
+    slope = derivative(x, grid, 0)
+    torch.testing.assert_close(slope, ((x[:, :, 1:] - x[:, :, :1]) / 0.5).expand_as(x))
+    transposed = torch.zeros_like(y)
+    add_adjoint_derivative(transposed, y, grid, 0)
+    torch.testing.assert_close((y * slope).sum(), (transposed * x).sum())
 
 
 def test_wrong_input_is_refused():

@@ -6,10 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import (
     Image,
+    independence,
     is_oblique,
     luminance,
     orientation,
@@ -99,6 +102,20 @@ def test_what_cannot_be_registered(make_image):
         broken[0, 0, 2, 2] = value
         with pytest.raises(InputError, match="slice has pixels that are NaN"):
             require_registrable(Image(broken, image.grid, name="slice"))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@given(power=st.floats(-6, 6))
+@settings(max_examples=20, deadline=None)
+def test_the_scale_of_a_direction_is_no_fault_of_it(dim, power):
+    matrix = 10**power * torch.tensor([[0.9, -0.3, 0.1], [0.3, 0.9, 0.0], [0.0, 0.1, 1.0]])[:dim, :dim].double()
+    image = Image(torch.zeros(1, 1, *[4] * dim), Grid((4,) * dim), (), tuple(map(tuple, matrix.tolist())))
+    points = torch.rand(1, dim, 5, dtype=torch.float64)
+    torch.testing.assert_close(image.to_grid(image.to_world(points)), points)
+    assert 0.8 < independence(matrix) < 1 + 1e-9
+    matrix[:, 0] = 2 * matrix[:, 1]
+    with pytest.raises(InputError, match="singular"):
+        replace(image, direction=tuple(map(tuple, matrix.tolist())))
 
 
 @pytest.mark.parametrize(

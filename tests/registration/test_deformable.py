@@ -174,7 +174,6 @@ def test_colours_are_registered_and_warped_in_colour():
         (torch.rand(1, 1, 16, 16), torch.rand(1, 1, 16, 17), "moving must have shape"),
         (torch.rand(16, 16), torch.rand(16, 16), "fixed must be a tensor"),
         (torch.rand(1, 1, 16, 16), torch.rand(2, 1, 16, 16), "must agree in batch size"),
-        (torch.rand(1, 1, 16, 7), torch.rand(1, 1, 16, 7), "at least 8 voxels"),
         (torch.rand(1, 1, 16, 16), torch.full((1, 1, 16, 16), torch.nan), "NaN or infinite"),
         (torch.rand(1, 1, 16, 16), torch.ones(1, 1, 16, 16), "moving is constant"),
         (torch.rand(1, 1, 16, 16), Image(torch.rand(1, 1, 16, 16), Grid((16, 16))), "not one of each"),

@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from nested_settings import changed, settings_of
 from pictures import bend, blobs, disc
 from torch import Tensor
@@ -275,3 +277,70 @@ def test_where_the_moving_image_does_not_reach_nothing_is_compared(similarity):
     assert 0.2 < beyond.float().mean() < 0.5
     torch.testing.assert_close(found, known)
     assert known[1][beyond].abs().max() == 0
+
+
+@given(power=st.floats(-6, 6))
+@settings(max_examples=10, deadline=None)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_an_image_is_seen_alike_through_maps_of_any_scale(dim, power):
+    """Its file says another unit, and the map undoes it."""
+    shape, scale = (12, 14, 16)[-dim:], 10**power
+    fixed = Image(blobs(shape, 1), Grid(shape), (3.0,) * dim)
+    moving = replace(fixed, grid=Grid(shape, (scale,) * dim), origin=(3.0 * scale,) * dim)
+    affine = Affine(scale * torch.eye(dim, dtype=torch.float64), torch.zeros(dim, dtype=torch.float64))
+    both = placed_images(fixed, moving, Annotations())
+    problem = resample_pair(both[0], both[1].moved(affine.inverse()), fixed)
+    torch.testing.assert_close(problem.moving, fixed.data, atol=1e-4, rtol=0)
+    assert problem.mask is None or problem.mask.min() > 0.99
+
+
+def sliced(image: Image, axis: int, step: int, first: int = 1) -> Image:
+    """Every so many slices of an image, where they are."""
+    data = image.data.index_select(2 + axis, torch.arange(first, image.grid.shape[axis], step))
+    spacing = [h * step if k == axis else h for k, h in enumerate(image.grid.spacing)]
+    place = torch.tensor([first * h if k == axis else 0.0 for k, h in enumerate(image.grid.spacing)]).double()
+    origin = tuple(image.to_world(place.view(1, -1, 1)).flatten().tolist())
+    return replace(image, data=data, grid=Grid(tuple(data.shape[2:]), tuple(spacing)), origin=origin)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_slices_far_apart_show_the_other_image_as_they_show_their_own(axis):
+    """Seen through the slices of an image, the same image at full detail is what those slices give, wherever it is."""
+    shape = (24, 26, 28)
+    fixed = Image(blobs(shape, 2), Grid(shape, (1.5, 1.0, 0.8)), (4.0, -3.0, 9.0))
+    problem = resample_pair(*placed_images(fixed, sliced(fixed, axis, 6), Annotations()), fixed)
+    inside = problem.mask > 0.999
+    assert problem.held == (axis,)
+    torch.testing.assert_close(problem.fixed[inside], problem.moving[inside], atol=1e-4, rtol=0)
+    whole = resample_pair(*placed_images(fixed, sliced(fixed, axis, 2), Annotations()), fixed)
+    assert torch.equal(whole.fixed, fixed.data)
+    assert whole.held == ()
+
+
+@pytest.mark.parametrize("nodes", [2, 5, 7])
+@pytest.mark.parametrize("measure", ["lncc", "mind"])
+def test_nothing_is_moved_across_a_few_slices(nodes, measure):
+    shape = (nodes, 40, 44)
+    moving = blobs((40, 44), 1).unsqueeze(2) + 0.3 * blobs(shape, 4)
+    bent = bend(Grid(shape[1:]), 2.0)
+    u = torch.cat([torch.zeros_like(bent[:, :1]), bent], dim=1).unsqueeze(2).expand(1, 3, *shape)
+    fixed = warp(moving, u, Grid(shape))
+    result = register(fixed, moving, changed(QUICK, similarity=measure, start="auto"))
+    assert not result.displacement[:, 0].any()
+    assert not result.diagnosis.folds.any()
+    error = (result.displacement - u).norm(dim=1).mean()
+    assert error < 0.6 * u.norm(dim=1).mean()
+
+
+def test_a_few_slices_far_apart_do_not_bend_the_map():
+    """Slices of another time, far apart: the map ends nearer to the known one than the files are."""
+    shape = (30, 40, 44)
+    grid = Grid(shape)
+    fine = blobs(shape, 1) + 0.5 * torch.randn(1, 1, *shape, generator=torch.Generator().manual_seed(2))
+    moving, u = Image(fine, grid), bend(grid, 1.5)
+    fixed = replace(moving, data=warp(moving.data, u, grid))
+    result = register(fixed, sliced(moving, 0, 5, 3), changed(QUICK, weight_div=0.5))
+    seen = (slice(None), slice(None), slice(5, 27), slice(4, -4), slice(4, -4))
+    errors = [(w - u)[seen].norm(dim=1).mean() for w in (torch.zeros_like(u), result.displacement)]
+    assert errors[1] < errors[0]
+    assert not result.displacement[:, 0].any()

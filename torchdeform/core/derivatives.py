@@ -44,13 +44,17 @@ def derivative(field: Tensor, grid: Grid, axis: int, *, order: int = 2, by: str 
         InputError: shape, axis, order, way, or an axis too short for the kernel.
 
     Notes:
-        Exact on polynomials of degree ``order``; error O(h^order). Linear, so differentiable to every degree.
+        Exact on polynomials of degree ``order``; error O(h^order). Linear, so differentiable to every degree. With
+        order 2 an axis of only two nodes has their difference at both.
     """
     grid.check(field, "derivative: field")
     require_choice(axis, range(grid.dim), "derivative: axis")
     require_choice(order, KERNELS, "derivative: order")
     require_choice(by, _WAYS, "derivative: by")
     (interior, first), apply = KERNELS[order], _WAYS[by]
+    if grid.shape[axis] == order == 2:
+        difference = field.diff(dim=axis + 2) / grid.spacing[axis]
+        return torch.cat([difference, difference], dim=axis + 2)
     if grid.shape[axis] < len(interior):
         raise InputError(f"derivative: order {order} needs {len(interior)} nodes along axis {axis}, got {grid.shape}")
     step, dim = grid.spacing[axis], axis + 2
@@ -76,6 +80,11 @@ def add_adjoint_derivative(total: Tensor, field: Tensor, grid: Grid, axis: int, 
         order: 2 or 4.
     """
     (interior, first), dim, n = KERNELS[order], axis + 2, grid.shape[axis]
+    if n == order == 2:
+        both = field.sum(dim) / grid.spacing[axis]
+        total.select(dim, 0).sub_(both)
+        total.select(dim, 1).add_(both)
+        return
     step, count = grid.spacing[axis], grid.shape[axis] - len(KERNELS[order][0]) + 1
     inner = field.narrow(dim, len(first), count)
     for k, weight in enumerate(interior):

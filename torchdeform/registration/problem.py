@@ -288,10 +288,9 @@ def _through(seen: Image, image: Image) -> Tensor:
     def values(rows: slice) -> Tensor:
         points = grid.points(dtype=torch.float64, device=seen.data.device, rows=rows)
         number = image.to_grid(seen.to_world(points))[:, axis : axis + 1] / image.grid.spacing[axis]
-        last = image.grid.shape[axis] - 1
-        number, below = number.clamp(0, last), number.floor().clamp(0, last - 1)
+        below = number.floor().clamp(0, image.grid.shape[axis] - 2)
         first, second = (sample(seen.data, points + (k - number) * step, grid) for k in (below, below + 1))
-        return first.lerp(second, (number - below).to(first))
+        return first.lerp(second, (number - below).clamp(0, 1).to(first))
 
     return over_slabs(values, grid.shape, seen.data.device)
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from affine_pairs import distance, empty, make_pair, make_true, picture, scene, turn
+from pictures import blobs
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
@@ -163,6 +164,53 @@ def test_a_wrong_spacing_is_told():
     moving = picture(empty((84, 68), (3.0, 3.0)), make_true(2.6 * torch.eye(2, dtype=torch.float64)).inverse())
     found = align(fixed, moving, "similarity")
     assert any("check the spacing" in sentence for sentence in found.warnings)
+
+
+def texture(shape: tuple[int, int]) -> torch.Tensor:
+    """Structure of several widths, fading to nothing at the borders."""
+    coarse = torch.nn.functional.interpolate(blobs(tuple(n // 3 for n in shape), 5), size=shape, mode="bicubic")
+    x = [torch.linspace(-1, 1, n) for n in shape]
+    return (coarse + 0.7 * blobs(shape, 6)) * torch.sigmoid(
+        12 * (0.8 - torch.hypot(*torch.meshgrid(*x, indexing="ij")))
+    )
+
+
+@pytest.mark.parametrize(
+    "ratio", [1e-3, 16.0, *(pytest.param(ratio, marks=pytest.mark.slow) for ratio in (1e-6, 0.0625, 1e3, 1e6))]
+)
+def test_one_content_in_other_units_is_found(ratio):
+    """The same pixels, shifted by some, in two units: the map is the ratio of the units."""
+    whole = texture((110, 130))
+    fixed = Image(whole[:, :, 3:103, 2:122], Grid((100, 120)))
+    moving = Image(whole[:, :, 7:107, 5:125], Grid((100, 120), (ratio, ratio)))
+    true = make_true(ratio * torch.eye(2, dtype=torch.float64), -3 * ratio, -4 * ratio)
+    for images, expected in (((fixed, moving), true), ((moving, fixed), true.inverse())):
+        found = align(*images)
+        scale = min(images[1].grid.spacing) / min(images[0].grid.spacing)
+        assert distance(found.affine, expected, images[0]) < 0.5 * scale
+        assert any("check the spacing" in sentence for sentence in found.warnings)
+
+
+@pytest.mark.parametrize("first", [(30, 150), (120, 60)])
+@pytest.mark.parametrize("known", [True, False])
+def test_a_part_is_found_in_the_whole(first, known):
+    """A sixth of the side, where the file places it or at the origin; and the whole about the part."""
+    whole, side = texture((240, 264)), 40
+    fixed = Image(whole, Grid((240, 264)))
+    data = whole[:, :, first[0] : first[0] + side, first[1] : first[1] + side]
+    part = Image(data, Grid((side, side)), tuple(first[::-1]) if known else ())
+    shift = (0.0, 0.0) if known else tuple(-float(k) for k in first[::-1])
+    true = make_true(torch.eye(2, dtype=torch.float64), *shift)
+    assert distance(align(fixed, part).affine, true, fixed) < 1
+    assert distance(align(part, fixed).affine, true.inverse(), part) < 0.5
+
+
+def test_a_part_without_spacing_is_found():
+    whole = texture((240, 264))
+    fixed = Image(whole, Grid((240, 264), (0.5, 0.5)))
+    part = Image(whole[:, :, 100:150, 90:140], Grid((50, 50), (3.0, 3.0)))
+    true = make_true(6 * torch.eye(2, dtype=torch.float64), -270.0, -300.0)
+    assert distance(align(fixed, part).affine, true, fixed) < 6
 
 
 def test_colour_is_aligned_on_its_luminance():

@@ -41,6 +41,9 @@ _LITTLE_OVERLAP = 0.5
 _LENGTH_FACTORS = (0.5, 2.0)
 
 
+_NOTHING = SearchResult([])
+
+
 @dataclass(frozen=True)
 class Alignment:
     """The map that aligns two images.
@@ -137,7 +140,7 @@ class _Trial:
     guess: Guess
     frame: NormalisedFrame
     levels: list[tuple[MaskedImage, MaskedImage]]
-    found: SearchResult
+    found: SearchResult = _NOTHING
 
     def objectives(self, settings: AlignmentSettings) -> list[AffineObjective]:
         """Return those of all levels, coarse to fine, both images blurred alike by the best map."""
