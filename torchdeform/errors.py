@@ -1,12 +1,24 @@
 """Typed errors: one sentence that says what is wrong, where, and what to do about it."""
 
 import difflib
+import errno
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
+# What a disk answers that is full, read-only, broken or gone, and a system that has no more open files to give.
+_OF_MACHINE = {
+    number
+    for name in (
+        "ENOSPC", "EDQUOT", "EROFS", "EIO", "ESTALE", "EFBIG", "EMFILE", "ENFILE", "ENOTCONN", "EREMOTEIO", "ETIMEDOUT",
+    )
+    if (number := getattr(errno, name, None)) is not None
+}  # fmt: skip
+
 # Set in the environment: the shell shows the traceback of an error.
 TRACEBACK = "TORCHDEFORM_TRACEBACK"
+
+_WIDEST, _MOST_BITS = 80, 1000  # characters of a wrong value, and bits of a number, that are shown
 
 
 class TorchdeformError(Exception):
@@ -21,9 +33,30 @@ class ComputationError(TorchdeformError, RuntimeError):
     """The input was fine, the computation failed (exit code 1 at the shell)."""
 
 
+class MachineError(ComputationError):
+    """The machine failed, such as a disk that is full or gone: nothing is settled, the same command goes on later."""
+
+
+def of_machine(error: BaseException | None) -> OSError | MachineError | None:
+    """Return the failure of the machine that an error is or comes from, None if there is none."""
+    while error is not None:
+        if isinstance(error, MachineError) or (isinstance(error, OSError) and error.errno in _OF_MACHINE):
+            return error
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+    return None
+
+
+def shown(value: object) -> str:
+    """Return a wrong value as it is written, as far as a sentence has room for it."""
+    if isinstance(value, int) and value.bit_length() > _MOST_BITS:  # Python refuses to write the longest
+        return "a number of too many digits"
+    text = repr(value)
+    return text if len(text) <= _WIDEST else f"{text[:_WIDEST]}..."
+
+
 def nearest_name(name: str, known: Iterable[str]) -> str:
     """Return ``"; did you mean 'x'?"`` for the known name nearest to ``name``, else an empty string."""
-    match = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    match = difflib.get_close_matches(name[:_WIDEST], list(known), n=1, cutoff=0.5)
     return f"; did you mean '{match[0]}'?" if match else ""
 
 
@@ -32,7 +65,8 @@ def require_choice(value: object, choices: Iterable[object], where: str) -> None
     known = list(choices)
     if value not in known:
         names = [str(choice) for choice in known]
-        raise InputError(f"{where} must be one of {', '.join(names)}, got {value!r}{nearest_name(str(value), names)}")
+        hint = nearest_name(value, names) if isinstance(value, str) else ""
+        raise InputError(f"{where} must be one of {', '.join(names)}, got {shown(value)}{hint}")
 
 
 # What a number must be: the test, and the words for it; those that are asked for often have a name.
@@ -63,11 +97,16 @@ def require_ranges(settings: object, prefix: str, **ranges: str | Range) -> None
         value = getattr(settings, name)
         numbers = value if isinstance(value, tuple | list) else (value,)
         if not numbers or not all(number is None or fits(number) for number in numbers):
-            raise InputError(f"{prefix}{name} must {words}, got {value!r}")
+            raise InputError(f"{prefix}{name} must {words}, got {shown(value)}")
 
 
 def explain(error: Exception) -> tuple[str, int]:
     """Return what to tell a person about an error, and the exit code."""
+    machine = of_machine(error)
+    if isinstance(machine, OSError):
+        where = machine.filename or "the disk"
+        return f"{where}: {machine.strerror}; mend that, or make room, and run the same command again", 1
+    error = machine or error
     if isinstance(error, InputError):
         return str(error), 2
     if isinstance(error, ComputationError):

@@ -26,8 +26,11 @@ def test_the_verb_reads_settings_and_records(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "cannot be read"),
-        ("no json", "no record of a registration"),
+        (None, "result.json does not exist"),
+        (
+            "no json",
+            "is no valid JSON (Expecting value: line 1 column 1 (char 0)); give a result.json of a registration",
+        ),
         ("[1]", "no record of a registration"),
         ('{"settings": {"similarity": "mindd"}}', "similarity must be one of"),
     ],

@@ -14,13 +14,13 @@ from torchdeform.pipeline.register import PairFiles
 
 @pytest.fixture
 def touch(tmp_path) -> Callable[..., Path]:
-    """Return ``touch(names)``: makes empty files below the test's folder, and returns the folder."""
+    """Return ``touch(names)``: makes small files below the test's folder, and returns the folder."""
 
     def make(names: Iterable[str]) -> Path:
         for name in names:
             path = tmp_path / name
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.touch()
+            path.write_text("x", encoding="ascii")
         return tmp_path
 
     return make

@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from bad_headers import size_or_death
 from nested_settings import changed
 
-from torchdeform.cohort.estimate import Costs, estimate, measure
+from torchdeform.cohort.estimate import Costs, estimate, measure, size_of
 from torchdeform.cohort.plan import Job
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
+from torchdeform.errors import InputError
 from torchdeform.io import write_image
 from torchdeform.pipeline.config import load_settings
 from torchdeform.pipeline.memory import footprint
@@ -76,3 +78,28 @@ def test_costs_of_files_that_say_nothing_are_unknown(tmp_path):
 )
 def test_times_are_readable(seconds, text):
     assert Costs(seconds, 0, 0).readable_time == text
+
+
+def test_a_header_that_takes_its_reader_with_it_costs_its_pair_only(jobs, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchdeform.cohort.estimate.size_of", size_or_death)
+    monkeypatch.setattr("torchdeform.cohort.estimate._HEADER", 5.0)
+    names = ["fine.png", "crash.png", "none.png", "hang.png"]
+    some = [
+        replace(job, files=replace(job.files, fixed=tmp_path / name)) for job, name in zip(jobs, names, strict=True)
+    ]
+    needs = measure([*some, replace(some[0], name="last")])
+    assert needs[0] == needs[-1] > 0
+    assert needs[1] == needs[3] == 0
+    costs = estimate(some)
+    assert (costs.unknown, sorted(costs.unreadable)) == (2, ["b", "d"])
+    assert "makes its reader crash" in costs.unreadable["b"]
+    assert "keeps the reader of its header busy" in costs.unreadable["d"]
+
+
+@pytest.mark.parametrize("error", [RuntimeError("what is this"), InputError("a.png is damaged"), MemoryError()])
+def test_a_header_that_cannot_be_read_is_a_sentence(tmp_path, monkeypatch, error):
+    def broken(_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("torchdeform.cohort.estimate.image_size", broken)
+    assert isinstance(size_of(tmp_path / "a.png"), str)

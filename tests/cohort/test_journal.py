@@ -1,17 +1,23 @@
 """The journal and the prints of inputs: what a crash leaves can be read, and what changed is noticed."""
 
+import errno
+import hashlib
 import json
+import math
 import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import SimpleITK as sitk
 from nested_settings import changed
 
-from torchdeform.cohort.journal import JOURNAL, Journal, Record
+from torchdeform.cohort.journal import JOURNAL, Journal, Record, open_lines
 from torchdeform.cohort.plan import Job
 from torchdeform.cohort.task import DONE, FAILED, PairReport
-from torchdeform.errors import InputError
+from torchdeform.errors import InputError, MachineError
 from torchdeform.pipeline.register import PairFiles
 from torchdeform.registration.settings import RegistrationSettings
 
@@ -68,14 +74,90 @@ def test_a_line_torn_anywhere_costs_that_line_only(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "line", [b"\xff\xfe\n", b"[]\n", b"3\n", b"{}\n", b'{"pair": "b"}\n', b'{"file": "f", "x": 1}\n', b"\0\n"]
-)
+    "change",
+    [
+        {"status": "finished"}, {"status": ["done"]}, {"status": None}, {"pair": 3}, {"key": None}, {"sentence": {}},
+        {"seconds": "1"}, {"seconds": -1}, {"seconds": math.inf}, {"seconds": math.nan}, {"peak_memory": 1.5},
+        {"peak_memory": 10**400}, {"figures": []}, {"figures": {"folds": [0]}}, {"files": "warped.png"},
+        {"files": [1]}, {"files": []}, {"files": None}, {"sentence": "x" * 2_000_000},
+    ],
+)  # fmt: skip
+def test_a_line_with_wrong_types_or_an_unknown_status_counts_for_nothing(tmp_path, change):
+    with Journal(tmp_path) as journal:
+        journal.record(Record("a", "1", REPORT))
+        journal.record(Record("b", "2", REPORT))
+    first, second = (tmp_path / JOURNAL).read_bytes().splitlines()
+    third = json.dumps(json.loads(second) | change)
+    (tmp_path / JOURNAL).write_bytes(b"\n".join([first, third.encode()]) + b"\n")
+    with Journal(tmp_path) as journal:
+        assert journal.records.keys() == {"a"}
+        assert journal.skipped >= 1
+
+
+@pytest.mark.parametrize(
+    "line",
+    [b"\xff\xfe\n", b"[]\n", b"3\n", b"{}\n", b'{"pair": "b"}\n', b"\0\n", b"[" * 100_000 + b"\n", b"{" * 3_000_000]
+)  # fmt: skip
 def test_lines_that_make_no_sense_are_skipped(tmp_path, line):
     with Journal(tmp_path) as journal:
         journal.record(Record("a", "1", REPORT))
     with (tmp_path / JOURNAL).open("ab") as file:
         file.write(line)
-    assert records(tmp_path).keys() == {"a"}
+    with Journal(tmp_path) as journal:
+        assert journal.records.keys() == {"a"}
+        assert journal.skipped
+
+
+def test_dates_of_files_that_earlier_versions_kept_are_no_wrong_lines(tmp_path):
+    (tmp_path / JOURNAL).write_text('{"file": "/a.png", "size": 1, "mtime_ns": 2, "digest": "x"}\n', encoding="ascii")
+    with Journal(tmp_path) as journal:
+        assert journal.skipped == 0
+
+
+def test_a_line_that_cannot_be_written_whole_is_not_written(tmp_path, monkeypatch):
+    """A full disk takes a part of it; what is written when there is space again stands on a line of its own."""
+    write = os.write
+
+    def full(file: int, line: memoryview) -> int:
+        if len(line) < 50:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(file, line[: len(line) - 40])
+
+    with Journal(tmp_path) as journal:
+        journal.record(Record("a", "1", REPORT))
+        before = (tmp_path / JOURNAL).read_bytes()
+        monkeypatch.setattr("os.write", full)
+        with pytest.raises(OSError, match="No space left"):
+            journal.record(Record("b", "2", REPORT))
+        monkeypatch.undo()
+        assert (tmp_path / JOURNAL).read_bytes() == before
+        assert journal.records.keys() == {"a"}
+        journal.record(Record("c", "3", REPORT))
+    assert records(tmp_path).keys() == {"a", "c"}
+
+
+def test_nothing_is_appended_to_what_could_block(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="pipe is no file"):
+        open_lines(tmp_path / "pipe")
+
+
+@pytest.mark.parametrize("how", ["removed", "replaced", "moved"])
+def test_a_journal_that_is_not_there_any_more_takes_no_records(tmp_path, how):
+    with Journal(tmp_path / "out") as journal:
+        (tmp_path / "out").rename(tmp_path / "other")
+        if how == "replaced":
+            shutil.copytree(tmp_path / "other", tmp_path / "out")
+        if how != "moved":
+            shutil.rmtree(tmp_path / "other")
+        with pytest.raises(MachineError, match="was removed or replaced while the run was working"):
+            journal.record(Record("a", "1", REPORT))
+
+
+def test_a_pipe_in_the_place_of_the_journal_is_refused(tmp_path):
+    os.mkfifo(tmp_path / JOURNAL)
+    with pytest.raises(InputError, match="is no file"):
+        Journal(tmp_path)
 
 
 def test_two_runs_of_one_folder_are_refused(tmp_path):
@@ -131,12 +213,19 @@ def test_a_file_that_comes_back_changes_the_print(tmp_path, job):
     assert fingerprint(tmp_path, job) != missing
 
 
-def test_pixels_in_a_file_of_their_own_count(tmp_path, job):
-    (tmp_path / "fixed.mhd").write_text("ElementDataFile = fixed.raw", encoding="ascii")
-    (tmp_path / "fixed.raw").write_bytes(b"1")
-    detached = replace(job, files=replace(job.files, fixed=tmp_path / "fixed.mhd"))
-    before = fingerprint(tmp_path, detached)
-    (tmp_path / "fixed.raw").write_bytes(b"2")
+@pytest.mark.parametrize(
+    ("header", "data"), [("a.mhd", "a.raw"), ("a.nhdr", "a.raw"), ("a.hdr", "a.img"), ("a.mhd", "b.raw")]
+)
+def test_pixels_in_a_file_of_their_own_count(tmp_path, job, header, data):
+    sitk.WriteImage(sitk.GetImageFromArray(np.zeros((4, 5, 6), np.uint8)), str(tmp_path / header))
+    if data == "b.raw":
+        (tmp_path / "a.raw").rename(tmp_path / data)
+        text = (tmp_path / header).read_text(encoding="ascii").replace("a.raw", data)
+        (tmp_path / header).write_text(text, encoding="ascii")
+    detached = replace(job, files=replace(job.files, fixed=tmp_path / header))
+    before, status = fingerprint(tmp_path, detached), (tmp_path / data).stat()
+    (tmp_path / data).write_bytes(bytes(status.st_size - 1) + b"1")
+    os.utime(tmp_path / data, ns=(status.st_atime_ns, status.st_mtime_ns))
     assert fingerprint(tmp_path, detached) != before
 
 
@@ -151,12 +240,32 @@ def test_every_slice_of_a_series_counts(tmp_path, job, given):
     assert fingerprint(tmp_path, of_series) != before
 
 
-def test_a_file_of_the_same_size_and_date_is_not_read_again(tmp_path, job, monkeypatch):
-    for path in (job.files.fixed, job.files.moving):
-        os.utime(path, (1e9, 1e9))
-    before = fingerprint(tmp_path, job)
-    monkeypatch.setattr("torchdeform.cohort.journal.hashlib.file_digest", lambda *_: pytest.fail("a file was read"))
-    assert fingerprint(tmp_path, job) == before
+def test_one_run_reads_a_file_once_and_the_next_run_reads_it_again(tmp_path, job, monkeypatch):
+    read, digest = [], hashlib.file_digest
+    monkeypatch.setattr("torchdeform.cohort.journal._SETTLED", -1)  # as if the files were old
+    monkeypatch.setattr("hashlib.file_digest", lambda file, kind: (read.append(file.name), digest(file, kind))[1])
+    for _ in range(2):
+        with Journal(tmp_path / "out") as journal:
+            assert len({journal.fingerprint(job) for _ in range(3)}) == 1
+    assert len(read) == 4
+
+
+@pytest.mark.parametrize("settled", [-(10**18), 10**18])
+def test_content_is_what_counts_whatever_the_dates_say(tmp_path, job, monkeypatch, settled):
+    """Written again, or replaced, with the size and date of before, in one run, and with a clock that goes back."""
+    monkeypatch.setattr("torchdeform.cohort.journal._SETTLED", settled)
+    with Journal(tmp_path / "out") as journal:
+        found = [journal.fingerprint(job)]
+        for text in ("FIXED.png", "FIXED.PNG"):
+            status = job.files.fixed.stat()
+            (tmp_path / "new").write_text(text, encoding="ascii")
+            if text == "FIXED.PNG":
+                (tmp_path / "new").replace(job.files.fixed)
+            else:
+                job.files.fixed.write_text(text, encoding="ascii")
+            os.utime(job.files.fixed, ns=(status.st_atime_ns, status.st_mtime_ns))
+            found.append(journal.fingerprint(job))
+    assert len(set(found)) == 3
 
 
 def test_the_date_of_a_file_just_written_is_not_trusted(tmp_path, job):

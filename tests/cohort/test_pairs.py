@@ -1,7 +1,5 @@
 """Where pairs come from: who is paired with whom, what goes along, and what is refused."""
 
-import errno
-import os
 import re
 
 import pytest
@@ -151,7 +149,11 @@ def test_tables(cohort_of, tmp_path, monkeypatch, name, separator):
         ("fixed,moving,fixd_mask\n", "line 1: there is no column 'fixd_mask'; did you mean 'fixed_mask'?"),
         ("fixed,movng\n", "line 1: there is no column 'movng'; did you mean 'moving'?"),
         ("fixed\n", "line 1: the column 'moving' is missing"),
-        ("", "line 1: the column 'fixed' is missing"),
+        ("\n", "line 1: the column 'fixed' is missing"),
+        ("", "pairs.csv is empty"),
+        ("fixed,moving\na.png,~nosuchuser/b\n", "line 2: '~nosuchuser/b': there is no user of this name"),
+        ("fixed,moving\na.png," + "../" * 3000 + "\n", "... is longer than a path can be"),
+        ('fixed,moving\na.png,"' + "b" * 200_000, "line 2: field larger than field limit"),
         ("fixed,moving,fixed\n", "line 1: the column 'fixed' occurs twice"),
         ("fixed,moving\na.png\n", "line 2: it has 1 cells but the first line 2"),
         ("fixed,moving\na.png,b.png,c.png\n", "line 2: it has 3 cells"),
@@ -168,7 +170,7 @@ def test_wrong_tables(cohort_of, tmp_path, text, sentence):
 
 
 def test_files_that_are_no_table(cohort_of, tmp_path):
-    with pytest.raises(InputError, match=os.strerror(errno.ENOENT)):
+    with pytest.raises(InputError, match=r"no\.csv does not exist"):
         pair_specs(cohort_of("pairs: {table: {file: no.csv}}\n"))
     with pytest.raises(InputError, match="the ending of a table"):
         pair_specs(cohort_of("pairs: {table: {file: no.xlsx}}\n"))

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 
 import pytest
 
@@ -147,3 +148,47 @@ def test_shipped_cohorts_find_their_images(name, count, data_folder, monkeypatch
     costs = estimate(work.jobs)
     assert costs.unknown == 0
     assert math.isfinite(costs.seconds)
+
+
+def test_what_is_no_file_is_a_problem_and_nobody_waits_for_it(touch, cohort_of, tmp_path):
+    touch(["a.png", "b.png"])
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "empty.png").touch()
+    (tmp_path / "loop.png").symlink_to("loop.png")
+    others = {
+        "pipe": ("pipe.png", "is no file but a device or a pipe"),
+        "device": ("/dev/zero", "is no file but a device or a pipe"),
+        "empty": ("empty.png", "is empty"),
+        "loop": ("loop.png", "does not exist"),
+        "long": ("x" * 300 + ".png", "does not exist"),
+    }
+    pairs = ", ".join(f"{{name: {name}, fixed: a.png, moving: {file}}}" for name, (file, _) in others.items())
+    work = plan(cohort_of(f"pairs: {{list: [{pairs}, {{name: fine, fixed: a.png, moving: b.png}}]}}\n"))
+    assert [job.name for job in work.jobs] == ["fine"]
+    for problem in work.problems:
+        assert others[problem.name][1] in problem.sentence
+        assert problem.sentence.startswith("moving ")
+
+
+def test_no_pair_leads_out_of_the_results(touch, cohort_of, tmp_path):
+    touch([*_IMAGES, "results/x", "elsewhere/x"])
+    (tmp_path / "results" / "sub-a").symlink_to(tmp_path / "elsewhere")
+    work = plan(cohort_of(_PATTERN))
+    assert [job.files.out.parent.name for job in work.jobs] == ["sub-b"]
+    assert "leads out of" in work.problems[0].sentence
+
+
+@pytest.mark.parametrize("name", ["..", ".", "a/b", "/a", "../x", "a\\0b", "x" * 250, "", "Logs", "journal.jsonl"])
+def test_names_that_no_folder_may_have_are_refused(touch, cohort_of, name):
+    touch(["a.png", "b.png"])
+    with pytest.raises(InputError, match=r"name|called"):
+        plan(cohort_of(f'pairs: {{list: [{{name: "{name}", fixed: a.png, moving: b.png}}]}}\n'))
+
+
+def test_subjects_and_names_of_patterns_stay_inside_and_short(touch, cohort_of, tmp_path):
+    touch([f"{'s' * 120}..-{'t' * 120}_1.png", f"{'s' * 120}..-{'t' * 120}_2.png", ".._1.png", ".._2.png"])
+    pattern = "{files: '{subject}_{run}.png', pairing: consecutive, within: [subject]}"
+    for job in plan(cohort_of(f"pairs: {{pattern: {pattern}}}\n")).jobs:
+        inside = job.files.out.relative_to(tmp_path / "results")
+        assert ".." not in inside.parts
+        assert all(len(part) <= 250 for part in inside.parts)

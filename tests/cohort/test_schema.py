@@ -1,8 +1,6 @@
 """The cohort file: what it means, what is refused and where, and what editors are told."""
 
-import errno
 import json
-import os
 
 import pytest
 
@@ -110,13 +108,13 @@ def test_wrong_files_are_explained(cohort_of, tmp_path, text, line, sentence):
 
 
 def test_out_is_needed(tmp_path):
-    (tmp_path / "empty.yaml").touch()
+    (tmp_path / "empty.yaml").write_text("# nothing\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"empty.yaml line 1: 'out' is missing"):
         read_cohort(tmp_path / "empty.yaml")
 
 
 def test_files_that_are_no_cohort(tmp_path):
-    with pytest.raises(InputError, match=os.strerror(errno.ENOENT)):
+    with pytest.raises(InputError, match=r"no\.yaml does not exist"):
         read_cohort(tmp_path / "no.yaml")
     (tmp_path / "list.yaml").write_text("- a\n", encoding="utf-8")
     with pytest.raises(InputError, match="must hold 'key: value' lines"):
@@ -132,9 +130,9 @@ def test_yaml_runs_nothing(cohort_of, tag):
 def test_aliases_without_end_are_refused(cohort_of):
     levels = ["a: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     levels += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 9)]
-    with pytest.raises(InputError, match="repeats its aliases too often"):
+    with pytest.raises(InputError, match="line 7: there are more than 1000000 entries, aliases written out"):
         cohort_of("\n".join(levels))
-    with pytest.raises(InputError, match="repeats its aliases too often"):
+    with pytest.raises(InputError, match=r"line 2: \*p stands inside of itself"):
         cohort_of("pairs: &p {list: [*p]}\n")
 
 

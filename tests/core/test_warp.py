@@ -241,9 +241,9 @@ def test_wrong_input_is_refused():
         warp(image[..., :-1], u, grid)
     with pytest.raises(InputError, match="sample: image must have shape"):
         sample(image[0], u, grid)
-    with pytest.raises(InputError, match=r"points must be floating-point of shape \(B, 2, \*T\), got \(1, 3, 7\)"):
+    with pytest.raises(InputError, match=r"points must have shape \(B, 2, \*T\), got \(1, 3, 7\)"):
         sample(image, torch.zeros(1, 3, 7), grid)
-    with pytest.raises(InputError, match=r"of torch\.int64"):
+    with pytest.raises(InputError, match=r"got torch\.int64"):
         sample(image, torch.zeros(1, 2, 7, dtype=torch.int64), grid)
     with pytest.raises(InputError, match="image has 2 batch items but the points have 3"):
         warp(image.expand(2, -1, -1, -1), u.expand(3, -1, -1, -1), grid)
@@ -251,3 +251,8 @@ def test_wrong_input_is_refused():
         compose(u, u[..., :-1], grid)
     with pytest.raises(InputError, match="invert: u"):
         invert(image, grid)
+
+
+def test_no_points_have_no_values():
+    grid = Grid((5, 6))
+    assert sample(torch.rand(2, 3, 5, 6), torch.zeros(2, 2, 0), grid).shape == (2, 3, 0)

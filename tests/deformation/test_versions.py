@@ -547,7 +547,7 @@ def test_wrong_times_and_starts_are_refused():
         track_moving_monitor(f.expand(3, 1, 1, 5, 5), grid, [0.0, 1.0])
     with pytest.raises(InputError, match=r"track_moving_monitor: f at time 0\.5 must be positive, got -1"):
         track_moving_monitor(lambda t: f * (-1 if t == 0.5 else 1), grid, [0.0, 1.0])
-    with pytest.raises(InputError, match="f at time 0 must be a floating-point tensor, got float"):
+    with pytest.raises(InputError, match="f at time 0 must be a floating-point tensor of 32 or 64 bits, got float"):
         track_moving_monitor(lambda t: t, grid, [0.0, 1.0])  # type: ignore[arg-type, return-value]
     with pytest.raises(InputError, match="track_moving_monitor: start must have shape"):
         track_moving_monitor(lambda _: f, grid, [0.0, 1.0], start=f)

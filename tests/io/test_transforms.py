@@ -138,7 +138,7 @@ def test_wrong_fields_are_refused(tmp_path, make_image, make_displacement):
     with pytest.raises(InputError, match="no displacement field"):
         read_displacement(tmp_path / "image.mha")
     (tmp_path / "text.txt").write_text("hello", encoding="utf-8")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="no image of a known format"):
         read_displacement(tmp_path / "text.txt")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["image.mha", "text.txt"]
 
@@ -330,10 +330,6 @@ def test_half_a_composite_file_is_refused(tmp_path, make_image, make_displacemen
 
 
 def test_other_transforms_are_refused(tmp_path):
-    spline = sitk.BSplineTransformInitializer(sitk.Image([20, 20], sitk.sitkFloat32), [3, 3])
-    sitk.WriteTransform(spline, str(tmp_path / "spline.tfm"))
-    with pytest.raises(InputError, match="holds a BSplineTransform"):
-        read_transform(tmp_path / "spline.tfm")
     flat = "#Insight Transform File V1.0\n#Transform 0\nTransform: AffineTransform_double_2_2\n"
     (tmp_path / "flat.tfm").write_text(f"{flat}Parameters: 0 0 0 0 1 2\nFixedParameters: 0 0\n", encoding="utf-8")
     with pytest.raises(InputError, match="singular"):

@@ -33,7 +33,7 @@ HOMES = {
     "typer": {"cli"},
     "rich": {"cli"},
     "pydantic": {"pipeline.config", "cohort"},
-    "yaml": {"pipeline.config"},
+    "yaml": {"io.texts"},
     "kornia": {"core.image"},
 }
 HEAVY = [

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from torchdeform.cli.options import Quiet, flag, say_written, table
-from torchdeform.cli.progress import CohortProgress, stoppable
+from torchdeform.cli.progress import CohortProgress
 from torchdeform.cohort.estimate import Costs, estimate
 from torchdeform.cohort.page import BADGES, VERDICTS
 from torchdeform.cohort.plan import DESCRIPTION, Plan, description, plan
@@ -59,7 +59,7 @@ def batch(
         typer.echo(overview(work, estimate(work.jobs)))
         return
     how = {"resume": resume, "retry_failed": retry_failed}
-    with stoppable("batch"), CohortProgress(quiet) as progress:
+    with CohortProgress(quiet) as progress:
         summary = _run(work, whole, cohort.engine, progress, how)
     if not quiet:
         typer.echo(outcome(summary))
@@ -113,4 +113,5 @@ def overview(work: Plan, costs: Costs) -> str:
     }
     if costs.unknown:
         sums["unknown"] = f"{costs.unknown} pairs whose size is unknown before they run, not counted"
-    return "\n".join([*pairs, *problems, table(sums)])
+    unreadable = [f"likely to fail: {name}: {why}" for name, why in costs.unreadable.items()]
+    return "\n".join([*pairs, *problems, *unreadable, table(sums)])

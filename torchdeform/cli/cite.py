@@ -1,6 +1,5 @@
 """``cite``: what to cite for a registration."""
 
-import json
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +8,7 @@ import typer
 
 from torchdeform.cli.register import Assignments, Config, Preset
 from torchdeform.errors import InputError
+from torchdeform.io.texts import read_json
 from torchdeform.pipeline.citations import bibtex
 from torchdeform.pipeline.config import load_settings, parse_override
 from torchdeform.registration.settings import RegistrationSettings
@@ -41,11 +41,9 @@ def recorded_settings(path: Path) -> RegistrationSettings:
     Raises:
         InputError: the file cannot be read, or is no record of a registration.
     """
-    try:
-        settings = dict(json.loads(path.read_text(encoding="utf-8"))["settings"])
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; give the result.json of a registration") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} is no record of a registration; give the result.json in its folder") from error
+    record = read_json(path, "result.json of a registration")
+    settings = record.get("settings") if isinstance(record, dict) else None
+    if not isinstance(settings, dict):
+        raise InputError(f"{path} is no record of a registration; give the result.json in its folder")
     known = {field.name for field in fields(RegistrationSettings)}
     return load_settings(overrides={key: value for key, value in settings.items() if key in known})

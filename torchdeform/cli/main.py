@@ -15,8 +15,11 @@ from torchdeform.cli.cite import cite
 from torchdeform.cli.deformation import adapt_grid, reconstruct, simulate
 from torchdeform.cli.options import Version
 from torchdeform.cli.register import register
+from torchdeform.cli.streams import STOPPED, interruptible, lost_output, steady
 from torchdeform.cli.template import template
 from torchdeform.errors import TRACEBACK, explain
+
+_STOP = "stopped; what is finished is kept and nothing is half-written, run the same command again to continue"
 
 
 class Verb(NamedTuple):
@@ -118,9 +121,13 @@ def _root(version: Version = False) -> None:
 
 
 def _run(app: typer.Typer, name: str, arguments: Sequence[str] | None) -> int:
-    """Run a command. Every error becomes one sentence and an exit code."""
+    """Run a command. Every error, and a stop, becomes one sentence and an exit code."""
+    steady()
     try:
-        return app(args=arguments, prog_name=name, standalone_mode=False) or 0
+        with interruptible():
+            code = app(args=arguments, prog_name=name, standalone_mode=False) or 0
+    except KeyboardInterrupt:
+        code = STOPPED
     except Exception as error:  # at the shell a person gets a sentence, not a traceback
         if os.environ.get(TRACEBACK):
             raise
@@ -128,6 +135,12 @@ def _run(app: typer.Typer, name: str, arguments: Sequence[str] | None) -> int:
         if sentence:
             typer.echo(f"{name}: {sentence}", err=True)
         return code
+    if code == STOPPED:
+        typer.echo(f"{name}: {_STOP}", err=True)
+    elif why := lost_output():
+        typer.echo(f"{name}: standard output cannot be written: {why}; the work itself is done", err=True)
+        return code or 1
+    return code
 
 
 def _usage_error(error: typer.TyperException) -> tuple[str, int]:

@@ -1,8 +1,6 @@
-"""Progress of a registration or a cohort: a bar on a terminal, a cohort's lines elsewhere; and how a run is stopped."""
+"""Progress of a registration or a cohort: a bar on a terminal, a cohort's lines elsewhere."""
 
-import signal
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from datetime import timedelta
 from typing import Self
 
@@ -16,31 +14,12 @@ from torchdeform.cohort.task import FAILED
 from torchdeform.core.stages import heard_by
 from torchdeform.registration.result import Progress as Step
 
-_STOPPED = 130  # exit code of a command that Ctrl-C ended, as shells have it
-
 # Where on the bar a stage of a registration begins; the levels lie between two of them.
 _STAGES = {
     "reading": 0.0, "aligning": 0.05, "searching": 0.2, "inverting": 0.8, "judging": 0.85, "writing": 0.9,
     "drawing": 0.93,
 }  # fmt: skip
 _LEVELS = (0.25, 0.8)
-
-
-@contextmanager
-def stoppable(verb: str) -> Iterator[None]:
-    """End the command in order when Ctrl-C or SIGTERM, by which queues end their jobs, stops the block."""
-
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    earlier = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    except KeyboardInterrupt:
-        typer.echo(f"{verb}: stopped; finished work is kept, run the same command again to continue", err=True)
-        raise typer.Exit(_STOPPED) from None
-    finally:
-        signal.signal(signal.SIGTERM, earlier)
 
 
 class _Bar:

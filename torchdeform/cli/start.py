@@ -5,21 +5,34 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from torchdeform.cli.streams import STOPPED, steady
+
 _COMPLETION = "_TORCHDEFORM_COMPLETE"  # set while a shell asks for completions
 
 
 def register() -> int:
     """Run ``register``."""
-    with _loading():
+    with _starting():
         from torchdeform.cli.main import main
     return main()
 
 
 def torchdeform() -> int:
     """Run ``torchdeform``."""
-    with _loading():
+    with _starting():
         from torchdeform.cli.main import torchdeform
     return torchdeform()
+
+
+@contextmanager
+def _starting() -> Iterator[None]:
+    """Load in this block: with streams that bear everything, and an end without a traceback if it is stopped."""
+    steady()
+    try:
+        with _loading():
+            yield
+    except KeyboardInterrupt:
+        raise SystemExit(STOPPED) from None
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import typer
 
 from torchdeform.cli.batch import RetryFailed
 from torchdeform.cli.options import Quiet, table
-from torchdeform.cli.progress import CohortProgress, stoppable
+from torchdeform.cli.progress import CohortProgress
 from torchdeform.cohort.run import Event
 from torchdeform.cohort.schema import read_cohort
 from torchdeform.cohort.template import RECORD, Built, build
@@ -28,7 +28,7 @@ def template(cohort_file: CohortFile, retry_failed: RetryFailed = False, quiet: 
     (maps points of the template to the image and warps the image onto the template) and inverse.h5 (the other way).
     """
     cohort = read_cohort(cohort_file)
-    with stoppable("template"), _Rounds(cohort.template.rounds, quiet) as rounds:
+    with _Rounds(cohort.template.rounds, quiet) as rounds:
         built = build(cohort, retry_failed=retry_failed, report=rounds.show)
     if not quiet:
         typer.echo(summary(built))

@@ -1,15 +1,16 @@
 """What a cohort takes: time and memory, estimated from the headers of its images."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from torchdeform.cohort.plan import Job
 from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import pyramid_grids
-from torchdeform.errors import InputError
+from torchdeform.core.worker import TimeLimit, Worker, WorkerLost
+from torchdeform.errors import InputError, explain
+from torchdeform.io.gate import DAMAGED
 from torchdeform.io.images import image_size
 from torchdeform.pipeline.memory import choices, fitting_grid, footprint
 from torchdeform.registration.optimise import steps_on
@@ -18,6 +19,10 @@ from torchdeform.registration.optimise import steps_on
 # LNCC, by dimension; `Measure.time` has the others beside it.
 _PAIR = 1.5
 _PER_NODE_STEP = {2: 2e-7, 3: 3e-7}
+_HEADER = 60.0  # seconds that reading a header may take
+
+# Shape and channels of an image; None where its file does not say; a sentence where that cannot be read.
+Size = tuple[tuple[int, ...], int] | str | None
 
 
 @dataclass(frozen=True)
@@ -29,11 +34,13 @@ class Costs:
         memory: bytes of the largest.
         unknown: number of pairs whose size the files do not say, or for which the limit of memory is too small; they
             do not count.
+        unreadable: of those, the names of pairs whose header cannot be read, and why.
     """
 
     seconds: float
     memory: int
     unknown: int
+    unreadable: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def readable_time(self) -> str:
@@ -47,14 +54,17 @@ class Costs:
 
 def estimate(jobs: Sequence[Job]) -> Costs:
     """Return what pairs take, to about a factor of two in time; every level is taken to use all its steps."""
-    size = cache(size_of)
-    seconds = [_seconds(job, size(job.files.fixed)) for job in jobs]
+    found = _sizes(jobs)
+    sizes = [found[job.files.fixed] for job in jobs]
+    seconds = [_seconds(job, size) for job, size in zip(jobs, sizes, strict=True)]
     known = [value for value in seconds if value is not None]
-    return Costs(sum(known), max(measure(jobs), default=0), len(seconds) - len(known))
+    needs = [_need(job, size) for job, size in zip(jobs, sizes, strict=True)]
+    unreadable = {job.name: size for job, size in zip(jobs, sizes, strict=True) if isinstance(size, str)}
+    return Costs(sum(known), max(needs, default=0), len(seconds) - len(known), unreadable)
 
 
-def _seconds(job: Job, size: tuple[tuple[int, ...], int] | None) -> float | None:
-    if size is None:
+def _seconds(job: Job, size: Size) -> float | None:
+    if not isinstance(size, tuple):
         return None
     (shape, channels), settings = size, job.settings
     grid, (measures, _, symmetric) = Grid(shape), choices(settings)
@@ -72,25 +82,46 @@ def _seconds(job: Job, size: tuple[tuple[int, ...], int] | None) -> float | None
 
 
 def measure(jobs: Sequence[Job]) -> list[int]:
-    """Return about how many bytes each pair takes at most, 0 where its image does not say.
+    """Return about how many bytes each pair takes at most, 0 where its image does not say."""
+    sizes = _sizes(jobs)
+    return [_need(job, sizes[job.files.fixed]) for job in jobs]
+
+
+def _sizes(jobs: Sequence[Job]) -> dict[Path, Size]:
+    """Return the sizes of fixed images.
 
     Notes:
-        Loads ITK, so it is called in a process that is not short of memory.
+        Headers are read in a process of its own, which ends with this function: it needs memory, and a file may crash
+        it or keep it for ever. That costs this file only.
     """
-    size = cache(size_of)
-    return [_need(job, size(job.files.fixed)) for job in jobs]
+    reader = Worker()
+    try:
+        return {path: _size(path, reader) for path in {job.files.fixed: None for job in jobs}}
+    finally:
+        reader.stop()
 
 
-def size_of(path: Path) -> tuple[tuple[int, ...], int] | None:
-    """Return the shape and channels of an image from its header, None where it does not say."""
+def _size(path: Path, reader: Worker) -> Size:
+    try:
+        return reader.call(size_of, path, timeout=_HEADER)
+    except WorkerLost:
+        return f"{path} makes its reader crash, so it {DAMAGED}"
+    except TimeLimit:
+        return f"{path} keeps the reader of its header busy for more than {_HEADER:.0f} s, so it {DAMAGED}"
+
+
+def size_of(path: Path) -> Size:
+    """Return shape and channels of an image from its header, None where it does not say, or why it cannot be read."""
     try:
         return image_size(path)
     except OSError:  # the pair itself will say so
         return None
+    except Exception as error:  # noqa: BLE001 - nothing about one file may stop the others
+        return explain(error)[0]
 
 
-def _need(job: Job, size: tuple[tuple[int, ...], int] | None) -> int:
-    if size is None:
+def _need(job: Job, size: Size) -> int:
+    if not isinstance(size, tuple):
         return job.memory or 0
     shape, channels = size
     need = footprint(Grid(shape), channels, job.settings)

@@ -1,6 +1,5 @@
 """Learn2Reg: the pairs in the JSON of a data set, and the names of displacement fields in a submission."""
 
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 from torchdeform.cohort.names import PairSpec, pair_name
 from torchdeform.cohort.schema import Learn2Reg
 from torchdeform.errors import InputError
+from torchdeform.io.texts import read_json
 
 _PAIRS = {"train": "training_paired_images", "val": "registration_val", "test": "registration_test"}
 _LISTS = ("training", "test")
@@ -33,15 +33,20 @@ def learn2reg_pairs(source: Learn2Reg) -> list[PairSpec]:
     return [_pair_spec(pair, images, source.file, f"{key}[{n}]") for n, pair in enumerate(pairs)]
 
 
-def submission_name(fixed: Path, moving: Path) -> str:
-    """Return ``disp_0001_0002.nii.gz``, the name that the evaluation of the challenge expects.
+def submission_names(fixed: Path, moving: Path) -> tuple[str, ...]:
+    """Return the names that evaluations of the challenge look for, the best known one first.
 
     Args:
         fixed: image named ``..._CASE_MODALITY.nii.gz``, four digits each.
-        moving: likewise. The name contains the modalities unless they are equal, or 0000 and 0001.
+        moving: likewise.
 
     Raises:
         InputError: another name.
+
+    Notes:
+        The evaluation of 2025-02-10 looks for ``disp_0001_0002.nii.gz`` where the modalities are 0000 and 0001, and
+        for ``disp_0001_0000_0002_0000.nii.gz`` elsewhere; older copies look for the short name where both modalities
+        are the same. Wherever one of them may look for the short name there are both.
     """
     cases = []
     for path in (fixed, moving):
@@ -50,18 +55,14 @@ def submission_name(fixed: Path, moving: Path) -> str:
             raise InputError(f"{path.name} must end in _CASE_MODALITY.nii.gz, four digits each, for a submission")
         cases.append((found[1], found[2]))
     (one, other), modalities = (case[0] for case in cases), tuple(case[1] for case in cases)
+    whole = f"disp_{one}_{modalities[0]}_{other}_{modalities[1]}.nii.gz"
     if modalities[0] == modalities[1] or modalities == ("0000", "0001"):
-        return f"disp_{one}_{other}.nii.gz"
-    return f"disp_{one}_{modalities[0]}_{other}_{modalities[1]}.nii.gz"
+        return f"disp_{one}_{other}.nii.gz", whole
+    return (whole,)
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; check the name of the data set's JSON") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is no valid JSON: {error}; give the data set's NAME_dataset.json") from error
+    content = read_json(path, "NAME_dataset.json of a data set")
     if not isinstance(content, dict):
         raise InputError(f"{path} describes no data set; give its NAME_dataset.json")
     return content

@@ -56,7 +56,7 @@ def entity(name: str, value: str, sign: str = "-") -> str:
 
 def subject_of(parts: Mapping[str, str]) -> str:
     """Return ``sub-01`` if a part is the subject, else an empty string."""
-    return next((entity(k, v) for k, v in parts.items() if _ENTITIES.get(k, k) == _SUBJECT), "")
+    return _short(next((entity(k, v) for k, v in parts.items() if _ENTITIES.get(k, k) == _SUBJECT), ""))
 
 
 def image_name(path: Path, parts: Mapping[str, str]) -> str:

@@ -1,6 +1,5 @@
 """The pairs of a cohort: from a list, a table, a Learn2Reg data set, or among the images that patterns find."""
 
-import csv
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import fields
@@ -12,8 +11,10 @@ from torchdeform.cohort.names import PairSpec, entity, image_name, pair_name, sh
 from torchdeform.cohort.patterns import FoundFile, fill_parts, find, natural_key, search, single_file
 from torchdeform.cohort.schema import COMPANIONS, Cohort, Images, Pair, PatternPairs, checked_name
 from torchdeform.cohort.settings import absolute_path, expand
-from torchdeform.errors import InputError, nearest_name, require_choice
+from torchdeform.errors import InputError, nearest_name, require_choice, shown
 from torchdeform.io.files import suffix
+from torchdeform.io.gate import read_text
+from torchdeform.io.texts import csv_rows
 from torchdeform.pipeline.config import parse_override
 from torchdeform.pipeline.register import PairFiles
 
@@ -187,26 +188,23 @@ def table_pairs(path: Path) -> list[PairSpec]:
         InputError: the file is missing or no table, lacks a column, has an unknown one or a wrong row; with the line.
     """
     require_choice(suffix(path), _SEPARATORS, f"{path}: the ending of a table")
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; check the name of the table") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is no text; save it as UTF-8") from error
-    reader = csv.reader(lines, delimiter=_SEPARATORS[suffix(path)])
-    titles = [title.strip() for title in next(reader, [])]
+    rows = csv_rows(read_text(path, "table", legacy=True), str(path), _SEPARATORS[suffix(path)])
+    titles = [title.strip() for title in next(rows, (1, []))[1]]
     _require_columns(titles, path)
-    return [_row_pair(dict(zip(titles, _cells(row, titles, where), strict=True)), path.parent, where)
-            for row in reader if any(map(str.strip, row)) and (where := f"{path} line {reader.line_num}")]  # fmt: skip
+    places = ((f"{path} line {line}", row) for line, row in rows)
+    return [
+        _row_pair(dict(zip(titles, _cells(row, titles, where), strict=True)), path.parent, where)
+        for where, row in places
+    ]
 
 
 def _require_columns(titles: list[str], path: Path) -> None:
     for title in titles:
         if title not in _COLUMNS and not title.startswith(_SETTING):
             hint = nearest_name(title, _COLUMNS) or f"; there are {', '.join(_COLUMNS)} and {_SETTING}KEY"
-            raise InputError(f"{path} line 1: there is no column '{title}'{hint}")
+            raise InputError(f"{path} line 1: there is no column {shown(title)}{hint}")
         if titles.count(title) > 1:
-            raise InputError(f"{path} line 1: the column '{title}' occurs twice; remove one")
+            raise InputError(f"{path} line 1: the column {shown(title)} occurs twice; remove one")
     for title in ("fixed", "moving"):
         if title not in titles:
             raise InputError(f"{path} line 1: the column '{title}' is missing; add it")

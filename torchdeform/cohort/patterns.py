@@ -2,15 +2,19 @@
 
 import glob
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from torchdeform.errors import InputError, nearest_name
+from torchdeform.errors import InputError, nearest_name, shown
+from torchdeform.io.isolated import isolated
 
 _TOKENS = re.compile(r"\{(?P<part>[A-Za-z_]\w*)\}|(?P<folders>\*\*/)|\[(?P<one>[^\]]+)\]|(?P<any>\*+)|(?P<single>\?)")
 _SPECIAL = frozenset("*?[{}")
 _ANYTHING = "[^/]+?"
+_LONGEST = 10_000  # characters of a regular expression
+_SECONDS, _SECONDS_PER_NAME = 10.0, 1e-4  # that matching may take
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,7 @@ def part_names(pattern: str) -> tuple[str, ...]:
     """
     rest = _TOKENS.sub("", pattern)
     if "{" in rest or "}" in rest:
-        raise InputError(f"{pattern!r}: a part is written {{name}}, with letters, digits and _ only")
+        raise InputError(f"{shown(pattern)}: a part is written {{name}}, with letters, digits and _ only")
     return tuple(dict.fromkeys(token["part"] for token in _TOKENS.finditer(pattern) if token["part"]))
 
 
@@ -46,17 +50,37 @@ def find(pattern: str, parts: Mapping[str, str]) -> list[FoundFile]:
             twice must be the same in both places.
         parts: regular expressions that parts must match, by name; anything but / if none is given.
     """
-    expression = _compiled(_translated(pattern, parts), pattern)
-    found = ((Path(path), expression.fullmatch(Path(path).as_posix())) for path in _matching(pattern))
-    return _sorted([FoundFile(path, match.groupdict()) for path, match in found if match])
+    paths = [Path(path) for path in _matching(pattern)]
+    return _matched(_translated(pattern, parts), {path.as_posix(): path for path in paths}, pattern)
 
 
 def search(folder: Path, expression: str) -> list[FoundFile]:
     """Return the files below a folder whose whole path there matches a regular expression with named groups."""
-    compiled = _compiled(expression, expression)
     files = (path for path in folder.rglob("*") if not path.is_dir())
-    found = ((path, compiled.fullmatch(path.relative_to(folder).as_posix())) for path in files)
-    return _sorted([FoundFile(path, match.groupdict("")) for path, match in found if match])
+    return _matched(expression, {path.relative_to(folder).as_posix(): path for path in files}, expression)
+
+
+def _matched(expression: str, files: Mapping[str, Path], written: str) -> list[FoundFile]:
+    """Return the files whose names match, sorted; ``written`` is the expression as it stands in the cohort file.
+
+    Notes:
+        Python's matching has no limit of time, and nested repetitions may take for ever, so another process does it.
+    """
+    compiled(expression, written)
+    seconds = _SECONDS + _SECONDS_PER_NAME * len(files)
+    try:
+        found = isolated(match_names, expression, list(files), path=Path(), size=0, seconds=seconds)
+    except InputError as error:
+        raise InputError(f"{shown(written)} takes too long to match; write it without repetitions in others") from error
+    return sorted(
+        (FoundFile(files[name], parts) for name, parts in found), key=lambda one: natural_key(one.path.as_posix())
+    )
+
+
+def match_names(expression: str, names: list[str]) -> list[tuple[str, dict[str, str]]]:
+    """Return the names that match a regular expression, and their parts."""
+    pattern = re.compile(expression)
+    return [(name, match.groupdict("")) for name in names if (match := pattern.fullmatch(name))]
 
 
 def fill_parts(pattern: str, parts: Mapping[str, str]) -> str:
@@ -101,10 +125,6 @@ def _matching(pattern: str) -> list[str]:
     return glob.glob(_TOKENS.sub(_to_glob, pattern), recursive=True)  # noqa: PTH207 - pathlib would find hidden files, too
 
 
-def _sorted(found: list[FoundFile]) -> list[FoundFile]:
-    return sorted(found, key=lambda one: natural_key(one.path.as_posix()))
-
-
 def _plain(pattern: str) -> str:
     """Return a pattern without its brackets around special characters."""
     return re.sub(r"\[([*?[{}])\]", r"\1", pattern)
@@ -138,8 +158,17 @@ def _piece(token: re.Match[str], parts: Mapping[str, str], seen: set[str]) -> st
     return {"folders": r"(?:[^/]+/)*", "any": "[^/]*", "single": "[^/]"}[token.lastgroup or ""]
 
 
-def _compiled(expression: str, shown: str) -> re.Pattern[str]:
+def compiled(expression: str, written: str) -> re.Pattern[str]:
+    """Return a regular expression; ``written`` is what stands in the cohort file.
+
+    Raises:
+        InputError: it is none, or longer or deeper than anybody writes one.
+    """
+    if len(expression) > _LONGEST:
+        raise InputError(f"{shown(written)} has {len(expression)} characters; write a shorter expression")
     try:
-        return re.compile(expression)
-    except re.error as error:
-        raise InputError(f"{shown!r} is no regular expression with these parts: {error}; check parts") from error
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about what later versions of Python may read otherwise
+            return re.compile(expression)
+    except (re.error, OverflowError, RecursionError) as error:
+        raise InputError(f"{shown(written)} is no regular expression with these parts: {error}; check parts") from error

@@ -2,19 +2,21 @@
 
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from torchdeform import __version__
-from torchdeform.cohort.learn2reg import submission_name
+from torchdeform.cohort.learn2reg import submission_names
 from torchdeform.cohort.names import PairSpec, select
 from torchdeform.cohort.pairs import pair_specs
 from torchdeform.cohort.schema import Cohort
 from torchdeform.errors import InputError, nearest_name
 from torchdeform.io import read_displacement, read_image
 from torchdeform.io.files import atomic_folder
+from torchdeform.io.gate import read_text, require_file, require_name
 from torchdeform.io.transforms import write_voxel_displacement
 from torchdeform.pipeline.register import Outcome, PairFiles, register_files
 from torchdeform.registration.result import Callback
@@ -33,6 +35,7 @@ class Job:
         memory: limit in bytes, None for all that is free.
         report: ``none``, ``light`` or ``full``, see `register_files`.
         submission: file for the displacement as the Learn2Reg challenge reads it, None for none.
+        also: further names of that file, which other versions of the challenge's evaluation look for.
         voxels: whether landmarks are rows of voxel indices without titles, as in Learn2Reg.
     """
 
@@ -43,6 +46,7 @@ class Job:
     memory: int | None = None
     report: str = "light"
     submission: Path | None = None
+    also: tuple[Path, ...] = ()
     voxels: bool = False
 
 
@@ -61,6 +65,7 @@ _RESERVED = (
 )
 
 _POINTS = ("fixed_points", "moving_points")
+_WHAT = {"mask": "mask", "labels": "label image", "points": "file of landmarks"}
 
 
 @dataclass(frozen=True)
@@ -117,12 +122,12 @@ def plan(cohort: Cohort) -> Plan:
     _require_apart(found, lambda pair: f"{pair.subject}/{pair.name}", "be called", "name")
     if cohort.layout == "learn2reg":
         whole = [pair for pair in found if not pair.problem]
-        _require_apart(whole, _submission, "be submitted as", "moving image")
+        _require_apart(whole, lambda pair: _submissions(pair)[0], "be submitted as", "moving image")
     resolve = _resolver(cohort)
     jobs: list[Job] = []
     problems: list[Failure] = []
     for pair in found:
-        sentence = pair.problem or _missing(pair)
+        sentence = pair.problem or _missing(pair) or _leading_out(pair, cohort.out)
         if sentence:
             problems.append(Failure(pair.name, sentence))
         else:
@@ -177,8 +182,13 @@ def _resolver(cohort: Cohort) -> Callable[[PairSpec], RegistrationSettings]:
 def _missing(pair: PairSpec) -> str:
     """Return a sentence about the files that a pair lacks, empty if there are all."""
     for key, path in pair.files.items():
-        if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises if a folder may not be read
-            return f"{key} {path} does not exist; check {pair.where}"
+        try:
+            require_name(path)
+            if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises if a folder may not be read
+                return f"{key} {path} does not exist; check {pair.where}"
+            require_file(path, _WHAT.get(key.partition("_")[2], "image file"), folder=True)
+        except InputError as error:
+            return f"{key} {error}; see {pair.where}"
     for what in ("points", "labels"):
         given = [side for side in ("fixed", "moving") if f"{side}_{what}" in pair.files]
         if len(given) == 1:
@@ -187,8 +197,18 @@ def _missing(pair: PairSpec) -> str:
     return ""
 
 
+def _leading_out(pair: PairSpec, out: Path) -> str:
+    """Return a sentence about the folder of a pair if it is not inside of ``out``, empty if it is."""
+    place = out / pair.subject / pair.name
+    if place.resolve() == out.resolve() or not place.resolve().is_relative_to(out.resolve()):
+        return f"its folder {place} leads out of {out}; remove the link there, or choose another out"
+    return ""
+
+
 def _job(pair: PairSpec, cohort: Cohort, settings: RegistrationSettings) -> Job:
     files = PairFiles(**pair.files, out=cohort.out / pair.subject / pair.name)
+    names = _submissions(pair) if cohort.layout == "learn2reg" else ()
+    submission, *also = [cohort.out / SUBMISSION / name for name in names] or [None]
     return Job(
         name=pair.name,
         files=files,
@@ -196,13 +216,14 @@ def _job(pair: PairSpec, cohort: Cohort, settings: RegistrationSettings) -> Job:
         device=cohort.device,
         memory=cohort.memory,
         report=cohort.report,
-        submission=cohort.out / SUBMISSION / _submission(pair) if cohort.layout == "learn2reg" else None,
+        submission=submission,
+        also=tuple(also),
         voxels=pair.voxels and pair.files.keys() >= {*_POINTS},
     )
 
 
-def _submission(pair: PairSpec) -> str:
-    return submission_name(pair.files["fixed"], pair.files["moving"])
+def _submissions(pair: PairSpec) -> tuple[str, ...]:
+    return submission_names(pair.files["fixed"], pair.files["moving"])
 
 
 def register_job(job: Job, *, callback: Callback | None = None) -> Outcome:
@@ -219,7 +240,18 @@ def register_job(job: Job, *, callback: Callback | None = None) -> Outcome:
         displacement = read_displacement(outcome.folder / "displacement.nii.gz")
         fixed, moving = read_image(files.fixed), read_image(files.moving)
         write_voxel_displacement(displacement.data, fixed, moving, job.submission)
+        for path in job.also:
+            _write_again(job.submission, path)
     return outcome
+
+
+def _write_again(file: Path, name: Path) -> None:
+    """Give a file another name, or make a copy of it where a file cannot have two."""
+    with atomic_folder(name.parent) as folder:
+        try:
+            (folder / name.name).hardlink_to(file)
+        except OSError:
+            shutil.copyfile(file, folder / name.name)
 
 
 def _with_titles(files: PairFiles) -> PairFiles:
@@ -227,6 +259,6 @@ def _with_titles(files: PairFiles) -> PairFiles:
     given = {key: path for key, path in files.given().items() if key in _POINTS}
     with atomic_folder(files.out) as folder:
         for key, path in given.items():
-            rows = path.read_text(encoding="utf-8-sig")
+            rows = read_text(path, "file of landmarks", legacy=True)
             (folder / f"{key}.csv").write_text(f"i,j,k\n{rows}", encoding="utf-8")
     return replace(files, **{key: files.out / f"{key}.csv" for key in given})

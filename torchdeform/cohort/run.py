@@ -1,7 +1,7 @@
 """The run of a cohort: every pair once, finished pairs skipped, every outcome written to disk at once."""
 
-import json
-import shutil
+import os
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -11,19 +11,22 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Self
 
-from torchdeform.cohort.executors.local import Engine
-from torchdeform.cohort.journal import Journal, Record
-from torchdeform.cohort.plan import Failure, Job
+from torchdeform.cohort.executors.local import Answer, Engine
+from torchdeform.cohort.journal import JOURNAL, Journal, Record, append, open_lines
+from torchdeform.cohort.plan import SUBMISSION, Failure, Job
 from torchdeform.cohort.settings import EngineSettings
 from torchdeform.cohort.summary import Summary, log_of, summarise
 from torchdeform.cohort.task import DONE, FAILED, PairReport, Task
+from torchdeform.core.memory import readable
 from torchdeform.core.worker import EngineError
-from torchdeform.errors import ComputationError, InputError, explain
+from torchdeform.errors import ComputationError, InputError, MachineError, explain, of_machine
+from torchdeform.io.files import disk_failure, remove_leftovers, size_of_files
+from torchdeform.pipeline.register import is_result
 
 EVENTS = "events.jsonl"
 BEGIN, SKIPPED, END = "begin", "skipped", "end"
 
-_TEMPORARY_FOLDERS = ".torchdeform-*"  # of `io.files.atomic_folder`, left by killed processes
+_CHANGED = "its files changed while it was registered; run the same command again when they stay as they are"
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,7 @@ def run(
 
     Raises:
         InputError: two pairs with one name, the folder cannot be written, or another run is working there.
+        MachineError: a disk is full, broken or gone. Nothing is settled for pairs that are not done.
         ComputationError: no pair can run at all, or the cluster is lost. Finished pairs are kept and the summary is
             written, as after Ctrl-C.
 
@@ -96,16 +100,25 @@ def run(
     total = len(jobs) + len(problems)
     with Journal(out) as journal, _EventLog(out, total, len(problems), report) as log:
         state = _State(out, journal, log)
+        _say_skipped(journal, out)
         try:
-            todo = [job for job in jobs if not (resume and state.is_finished(job, retry_failed))]
-            _remove_leftovers(todo, out)
-            if todo:
-                with _open(engine, todo, out) as where:
-                    _register_all(todo, where, state)
-        finally:
-            _remove_leftovers(jobs, out)
-            summary = summarise(jobs, out, state.reports, problems)
-        log.write(END)
+            log.write(BEGIN)
+            try:
+                todo = [job for job in jobs if not (resume and state.is_finished(job, retry_failed))]
+                _remove_leftovers(todo, out)
+                if todo:
+                    with _open(engine, todo, out) as where:
+                        _register_all(todo, where, state)
+                state.require_results(jobs)
+            finally:
+                journal.require_there()
+                _remove_leftovers(jobs, out)
+                summary = summarise(jobs, out, state.reports, problems)
+            log.write(END)
+        except Exception as error:
+            if (failure := of_machine(error)) is not None:
+                raise state.stopped_by(failure, jobs) from error
+            raise
     return summary
 
 
@@ -114,6 +127,14 @@ def review(jobs: Sequence[Job], out: Path, problems: Iterable[Failure] = ()) -> 
     with Journal(out) as journal:
         known = {name: record.report for name, record in journal.records.items()}
         return summarise(jobs, out, known, problems)
+
+
+def _say_skipped(journal: Journal, out: Path) -> None:
+    if journal.skipped:
+        text = (
+            f"{journal.skipped} lines of {out / JOURNAL} make no sense and are skipped; pairs without a line run again"
+        )
+        sys.stderr.write(f"warning: {text}\n")
 
 
 def _require_names(pairs: Sequence[Job | Failure]) -> None:
@@ -130,14 +151,13 @@ class _EventLog:
         self._total, self._report = total, report
         self._counts = Counter({FAILED: failed, SKIPPED: failed})
         self._start = time.monotonic()
-        self._file = (out / EVENTS).open("a", encoding="utf-8")
+        self._file = open_lines(out / EVENTS)
 
     def __enter__(self) -> Self:
-        self.write(BEGIN)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        os.close(self._file)
 
     def write(self, kind: str, name: str = "", about: PairReport | None = None) -> None:
         """Write an event, with the report of the pair if it is about a pair."""
@@ -155,8 +175,7 @@ class _EventLog:
             self._counts[SKIPPED],
             time.monotonic() - self._start,
         )
-        self._file.write(json.dumps({"time": time.time(), **asdict(event)}) + "\n")
-        self._file.flush()
+        append(self._file, {"time": time.time(), **asdict(event)})
         if self._report is not None:
             self._report(event)
 
@@ -180,7 +199,10 @@ class _State:
         return True
 
     def record(self, job: Job, key: str, report: PairReport) -> None:
-        """Write the outcome of a pair."""
+        """Write the outcome of a pair; it fails, and runs again, if its inputs are not those of its key any more."""
+        if report.status == DONE and self.journal.fingerprint(job) != key:
+            _remove_results(job, report)
+            report = PairReport(FAILED, _CHANGED, report.seconds)
         earlier = self.journal.records.get(job.name)
         if report.status == FAILED and earlier is not None:
             _remove_results(job, earlier.report)
@@ -188,10 +210,33 @@ class _State:
         self.reports[job.name] = report
         self._log.write(report.status, job.name, report)
 
+    def require_results(self, jobs: Sequence[Job]) -> None:
+        """Raise `MachineError` if results of pairs that are done are not there any more."""
+        lost = [
+            job.name for job in jobs if job.name in self.reports and not _results_exist(job, self.reports[job.name])
+        ]
+        for name in lost:
+            del self.reports[name]
+        if lost:
+            raise MachineError(
+                f"results of pairs that were done, such as {lost[0]}, were removed from {self.out} while the run was "
+                "working; run the same command again"
+            )
+
+    def stopped_by(self, failure: OSError | MachineError, jobs: Sequence[Job]) -> MachineError:
+        """Return the error of a run that a failure of the machine stops, with what is left and how much that takes."""
+        done = [job for job in jobs if job.name in self.reports and self.reports[job.name].status == DONE]
+        left = len(jobs) - len(self.reports)
+        sizes = [size_of_files(_results(job, self.reports[job.name])) for job in done]
+        needed = f", which take about {readable(left * sum(sizes) // len(sizes))}" if left and sizes else ""
+        sentence = str(disk_failure(failure, self.out) if isinstance(failure, OSError) else failure)
+        pairs = "pair" if left == 1 else f"{left} pairs"
+        return MachineError(f"{sentence} for the {pairs} left{needed}" if left else sentence)
+
 
 def _register_all(jobs: Sequence[Job], engine: Engine, state: _State) -> None:
     """Keep the engine busy until every job has a report."""
-    waiting, running = iter(jobs), dict[Future[PairReport], tuple[Job, str]]()
+    waiting, running = iter(jobs), dict[Future[Answer], tuple[Job, str]]()
     try:
         while _fill(running, waiting, engine, state):
             finished = wait(running, return_when=FIRST_COMPLETED).done
@@ -202,11 +247,12 @@ def _register_all(jobs: Sequence[Job], engine: Engine, state: _State) -> None:
     finally:  # Ctrl-C may come between the end of a pair and its line in the journal
         for future, (job, key) in running.items():
             if future.done() and not future.cancelled() and future.exception() is None:
-                state.record(job, key, future.result())
+                with suppress(Exception):  # an error about the process says nothing about the pair
+                    state.record(job, key, _answer(future))
 
 
 def _fill(
-    running: dict[Future[PairReport], tuple[Job, str]], waiting: Iterator[Job], engine: Engine, state: _State
+    running: dict[Future[Answer], tuple[Job, str]], waiting: Iterator[Job], engine: Engine, state: _State
 ) -> bool:
     """Submit jobs until the engine has enough; return whether any are running."""
     while len(running) < engine.window and (job := next(waiting, None)) is not None:
@@ -215,11 +261,19 @@ def _fill(
     return bool(running)
 
 
-def _report(future: Future[PairReport]) -> PairReport:
+def _answer(future: Future[Answer]) -> PairReport:
+    """Return the report of a task, or raise its error."""
+    answer = future.result()
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
+
+
+def _report(future: Future[Answer]) -> PairReport:
     """Return the report of a task; a lost process gives a report, too."""
     try:
-        return future.result()
-    except EngineError:
+        return _answer(future)
+    except (EngineError, MachineError):
         raise
     except CancelledError as error:
         raise ComputationError(
@@ -245,8 +299,8 @@ def _results_exist(job: Job, report: PairReport) -> bool:
 
 
 def _results(job: Job, report: PairReport) -> list[Path]:
-    named = [job.files.out / name for name in report.files if Path(name).name == name]
-    return named if job.submission is None else [*named, job.submission]
+    named = [job.files.out / name for name in filter(is_result, report.files)]
+    return named if job.submission is None else [*named, job.submission, *job.also]
 
 
 def _remove_results(job: Job, report: PairReport) -> None:
@@ -259,8 +313,7 @@ def _remove_results(job: Job, report: PairReport) -> None:
 
 def _remove_leftovers(jobs: Iterable[Job], out: Path) -> None:
     """Remove the unfinished files of killed processes."""
-    own = {job.files.out for job in jobs}
+    own = {job.files.out for job in jobs} | {out, out / SUBMISSION}
     above = {folder for place in own for folder in place.parents if folder.is_relative_to(out)}
     for folder in own | above:
-        for leftover in folder.glob(_TEMPORARY_FOLDERS):
-            shutil.rmtree(leftover, ignore_errors=True)
+        remove_leftovers(folder)

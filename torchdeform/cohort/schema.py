@@ -19,18 +19,11 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
-from torchdeform.cohort.patterns import part_names, require_parts
+from torchdeform.cohort.patterns import compiled, part_names, require_parts
 from torchdeform.cohort.settings import EngineSettings, Pattern, Place, Size, Strict, TemplateSettings
-from torchdeform.errors import InputError, nearest_name, require_choice
-from torchdeform.pipeline.config import (
-    Lines,
-    load_settings,
-    merged_settings,
-    preset_names,
-    read_yaml,
-    read_yaml_lines,
-    to_yaml,
-)
+from torchdeform.errors import InputError, nearest_name, require_choice, shown
+from torchdeform.io.texts import Lines, to_yaml
+from torchdeform.pipeline.config import load_settings, merged_settings, preset_names, read_yaml, read_yaml_lines
 from torchdeform.registration.settings import SHORT_FORMS, RegistrationSettings
 
 # Companions of an image by their keys here, with their names in a pair.
@@ -43,14 +36,13 @@ _BELONGS = {
     "both_ways": "all",
 }
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
-_LONGEST = 80  # characters of a wrong value that are shown
 
 
 def checked_name(name: str) -> str:
     """Return a name that a folder can have on any system; `InputError` if it is none."""
     if not _NAME.fullmatch(name):
         allowed = "letters, digits, '.', '_' and '-' only and starts with a letter or digit"
-        raise InputError(f"a name has {allowed}: {name!r}")
+        raise InputError(f"a name has {allowed}: {shown(name)}")
     return name
 
 
@@ -71,9 +63,9 @@ def _checked_parts(parts: dict[str, str]) -> dict[str, str]:
 
 def _checked_expression(expression: str, name: str = "expression") -> str:
     try:
-        re.compile(expression)
-    except re.error as error:
-        raise InputError(f"{name}: {expression!r} is no regular expression: {error}") from error
+        compiled(expression, expression)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
     return expression
 
 
@@ -165,7 +157,7 @@ class Images(Strict):
     def part_names(self) -> tuple[str, ...]:
         """Return the names of the parts that every image has."""
         if self.expression is not None:
-            return tuple(re.compile(self.expression).groupindex)
+            return tuple(compiled(self.expression, self.expression).groupindex)
         first, *others = (part_names(pattern) for pattern in self.files)
         return tuple(name for name in first if all(name in names for names in others))
 
@@ -359,12 +351,10 @@ def _sentence(error: ErrorDetails, keys: tuple[str | int, ...]) -> str:
     message = error["msg"].removeprefix("Value error, ")
     if kind == "value_error":
         return f"{where}{message}"
-    value = repr(error["input"])
-    shown = value if len(value) <= _LONGEST else f"{value[:_LONGEST]} ..."
     hint = nearest_name(str(error["input"]), re.findall(r"'(\w+)'", error.get("ctx", {}).get("expected", "")))
     if kind == "string_type" and isinstance(error["input"], int | float):
         hint = "; write it in quotes"
-    return f"{where}{shown}: {message}{hint}"
+    return f"{where}{shown(error['input'])}: {message}{hint}"
 
 
 def _dotted(keys: tuple[str | int, ...]) -> str:

@@ -11,8 +11,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 
 from torchdeform.cohort.patterns import literal, part_names
 from torchdeform.core.memory import parse_size
-from torchdeform.errors import InputError
+from torchdeform.errors import InputError, shown
 from torchdeform.registration.template import AveragingSettings, Pose
+
+_LONGEST_PATH = 4096  # characters
 
 
 class Strict(BaseModel):
@@ -43,7 +45,7 @@ def _substitute(text: str, form: Callable[[str], str]) -> str:
     except KeyError as error:
         raise InputError(f"the environment variable {error.args[0]} is not set; set it, or write the path") from error
     except ValueError as error:
-        raise InputError(f"{text!r} has a $ without the name of a variable; write $$ for a dollar sign") from error
+        raise InputError(f"{shown(text)} has a $ without the name of a variable; write $$ for a dollar sign") from error
 
 
 def _folder(info: ValidationInfo) -> Path:
@@ -53,7 +55,7 @@ def _folder(info: ValidationInfo) -> Path:
 
 def _text(value: object) -> str:
     if not isinstance(value, str | Path) or not str(value):
-        raise InputError(f"a path is a text, got {value!r}")
+        raise InputError(f"a path is a text, got {shown(value)}")
     return str(value)
 
 
@@ -70,8 +72,17 @@ def pattern(value: object, info: ValidationInfo) -> str:
 
 
 def absolute_path(folder: Path, text: str) -> Path:
-    """Return an absolute path as it is, another one below ``folder``; ``../`` at the start goes up from there."""
-    path = Path(text).expanduser()
+    """Return an absolute path as it is, another one below ``folder``; ``../`` at the start goes up from there.
+
+    Raises:
+        InputError: longer than any path can be, or ``~`` of a user that is not known.
+    """
+    if len(text) > _LONGEST_PATH:
+        raise InputError(f"{shown(text)} is longer than a path can be; check it")
+    try:
+        path = Path(text).expanduser()
+    except RuntimeError as error:
+        raise InputError(f"{shown(text)}: there is no user of this name, or no home folder; write the path") from error
     while path.parts[:1] == ("..",):
         folder, path = folder.parent, Path(*path.parts[1:])
     return folder / path
@@ -94,8 +105,8 @@ _written = PlainSerializer(lambda value: str(value).replace("$", "$$"), return_t
 Place = Annotated[Path, BeforeValidator(place), _written]
 Pattern = Annotated[str, BeforeValidator(pattern), _written]
 Size = Annotated[int, BeforeValidator(_size), Field(gt=0)]
-Count = Annotated[int, Field(ge=1)]
-Seconds = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+Seconds = Annotated[float, Field(gt=0, le=1e9)]
 Scheduler = Annotated[str, BeforeValidator(_scheduler)]
 
 
@@ -179,7 +190,7 @@ class TemplateSettings(Strict):
     """Scale all images to one mean and one standard deviation before they are averaged."""
     corrections: Count = AveragingSettings.corrections
     """Corrections in a round at most that bring the mean of the maps from the template to the identity."""
-    tolerance: Annotated[float, Field(ge=0)] = AveragingSettings.tolerance
+    tolerance: Annotated[float, Field(ge=0, le=1e9)] = AveragingSettings.tolerance
     """Largest displacement of that mean, in voxels, that counts as the identity."""
 
     @property

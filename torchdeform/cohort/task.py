@@ -14,7 +14,7 @@ from typing import Any
 
 from torchdeform.cohort.plan import Job, register_job
 from torchdeform.core.memory import peak
-from torchdeform.errors import InputError, explain
+from torchdeform.errors import InputError, MachineError, explain, of_machine
 
 DONE, FAILED = "done", "failed"
 
@@ -73,17 +73,32 @@ class PairReport:
 def perform(task: Task) -> PairReport:
     """Register a pair and report. Every error but the end of the process becomes a report, too.
 
+    Raises:
+        MachineError: a disk is full or gone, which says nothing about the pair.
+
     Notes:
         Everything that the process prints in that time goes to the log, even the traceback of a crash.
     """
+    try:
+        return _attempt(task)
+    except Exception as error:
+        if of_machine(error) is not None:
+            raise MachineError(explain(error)[0]) from None
+        raise
+
+
+def _attempt(task: Task) -> PairReport:
     start = perf_counter()
     with _logged(task.log):
         _log_job(task.job)
         _reset_peaks()
         try:
             report = _register(task.job, start)
-        except Exception as error:  # noqa: BLE001 - an error of one pair must not stop the others
-            report = PairReport(FAILED, _sentence(error), perf_counter() - start, *_peaks())
+        except Exception as error:
+            sentence = _sentence(error)
+            if of_machine(error) is not None:
+                raise
+            report = PairReport(FAILED, sentence, perf_counter() - start, *_peaks())
         sys.stderr.write(f"{strftime('%FT%T')} {report.status} {report.sentence}\n")
         return report
 

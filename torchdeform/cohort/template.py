@@ -22,6 +22,7 @@ from torchdeform.errors import ComputationError, InputError
 from torchdeform.io import read_image, read_transform, write_image, write_transform
 from torchdeform.io.files import atomic_folder, require_writable
 from torchdeform.io.images import ending_like, read_labels, write_labels
+from torchdeform.io.texts import read_json
 from torchdeform.pipeline.register import PairFiles, choose_device
 from torchdeform.registration.template import Lazy, Template, identity_map, make_template
 from torchdeform.report.figures import write_gallery
@@ -253,7 +254,7 @@ def _describe_map(map_: Transform) -> dict[str, Any]:
 def _recorded(path: Path, key: str) -> dict[str, Any] | None:
     """Return a record if an earlier run wrote it for the same images and settings."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        record = read_json(path, "record of a template")
+    except InputError:
         return None
     return record if isinstance(record, dict) and record.get("key") == key else None

@@ -98,7 +98,7 @@ def kernel_weights(kernel: Sequence[float], axis: int, dim: int, like: Tensor, s
         step: spacing along the axis.
     """
     shape = [1, 1, *(len(kernel) if a == axis else 1 for a in range(dim))]
-    return torch.tensor([w / step for w in kernel], dtype=torch.float64).view(shape).to(like)
+    return torch.tensor([w / step for w in kernel], dtype=torch.float64, device="cpu").view(shape).to(like)
 
 
 def _by_convolution(field: Tensor, dim: int, kernel: tuple[float, ...], step: float) -> Tensor:

@@ -23,6 +23,19 @@ UNITS = {"px": 1.0, "mm": 1.0, "µm": 1000.0}
 
 _Length = TypeVar("_Length", float, Tensor)
 
+# Directions less independent than this are no axes of a space.
+_INDEPENDENT = 1e-6
+
+
+def independence(matrix: Tensor) -> float:
+    """Return how far the columns of a matrix ``(D, D)`` are from lying in a plane, whatever their lengths, 1 to 0.
+
+    Notes:
+        |det| / Π |column|: a determinant alone carries the scale of the matrix to the power of D. 1 for right angles.
+    """
+    matrix = matrix.detach().double()
+    return float((torch.linalg.det(matrix).abs() / matrix.norm(dim=0).prod()).nan_to_num(0.0))
+
 
 @dataclass(frozen=True)
 class Image:
@@ -38,6 +51,7 @@ class Image:
         pixel_type: numpy name of the type it is stored with, for writing results alike.
         unit: what its lengths are shown in: ``px`` for files without a spacing, whose pixels are 1 apart, ``mm``, or
             ``µm`` where the file has it. Coordinates are in mm with both of the latter.
+        remarks: sentences about what its reader had to decide, which people should know.
 
     Raises:
         InputError: the parts do not fit together, or an unknown unit.
@@ -50,6 +64,7 @@ class Image:
     name: str = "image"
     pixel_type: str = "float32"
     unit: str = "mm"
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         dim = self.grid.dim
@@ -62,7 +77,7 @@ class Image:
         require_choice(self.unit, UNITS, f"{self.name}: unit")
         if not all(map(math.isfinite, self.origin)):
             raise InputError(f"{self.name}: its origin {self.origin} is not finite; correct the header of the file")
-        if not abs(float(torch.linalg.det(torch.tensor(self.direction, dtype=torch.float64)))) > 1e-6:
+        if not independence(torch.tensor(self.direction, dtype=torch.float64, device="cpu")) > _INDEPENDENT:
             raise InputError(f"{self.name}: its direction matrix is singular; correct the header of the file")
 
     def to_world(self, points: Tensor) -> Tensor:
@@ -158,7 +173,9 @@ def surroundings(image: Image) -> Tensor:
     faces = torch.cat([data.select(axis, end).flatten(2) for axis in range(2, data.dim()) for end in (0, -1)], dim=2)
     some = flat[..., :: 1 + flat.numel() // _SOME]
     faces, some = (torch.where(part.isfinite(), part, torch.nan) for part in (faces, some))
-    low, high = some.nanquantile(torch.tensor(_ENDS).to(flat), dim=2, interpolation="lower")
+    low, high = some.nanquantile(
+        torch.tensor(_ENDS, dtype=torch.float64, device="cpu").to(flat), dim=2, interpolation="lower"
+    )
     middle = faces.nanmedian(dim=2).values
     near = ((faces - middle.unsqueeze(2)).abs() <= _NEAR * (high - low).unsqueeze(2)).all(1)
     found = middle if float(near[faces.isfinite().all(1)].double().mean()) > _MOSTLY else low
@@ -172,7 +189,7 @@ def same_place(a: Image, b: Image) -> bool:
 
 def box_corners(grid: Grid) -> Tensor:
     """Return the corners of the box of a grid ``(1, D, 2^D)``, float64, the first and the last opposite each other."""
-    ends = [torch.tensor([0.0, side], dtype=torch.float64) for side in grid.extent]
+    ends = [torch.tensor([0.0, side], dtype=torch.float64, device="cpu") for side in grid.extent]
     return torch.cartesian_prod(*ends).T.unsqueeze(0)
 
 
@@ -239,8 +256,8 @@ def require_same_place(image: Image, other: Image, *, atol: float = 1e-3) -> Non
     if image.grid.shape != other.grid.shape:
         sizes = f"{image.grid.size_text} and {other.grid.size_text}"
         raise InputError(f"{image.name} and {other.name} must lie on one grid, but have {sizes} nodes; resample one")
-    ends = box_corners(image.grid)
-    apart = (image.to_world(ends) - other.to_world(ends)).norm(dim=1).max()
+    ends, others = (some.to_world(box_corners(some.grid)) for some in (image, other))
+    apart = (ends - others).norm(dim=1).max()
     if float(apart) > atol * min(other.grid.spacing):
         raise InputError(
             f"{image.name} and {other.name} must lie in one place, but their headers put them "
@@ -267,7 +284,7 @@ def overlap(fixed: Image, moving: Image, *, samples: int = 32) -> float:
         InputError: one image is 2D and the other 3D.
     """
     require_same_dimension(fixed, moving)
-    sides = [torch.linspace(0, side, samples, dtype=torch.float64) for side in fixed.grid.extent]
+    sides = [torch.linspace(0, side, samples, dtype=torch.float64, device="cpu") for side in fixed.grid.extent]
     points = torch.stack(torch.meshgrid(*sides, indexing="ij")).unsqueeze(0)
     return float(inside_box(moving.to_grid(fixed.to_world(points)), moving.grid).double().mean())
 

@@ -1,11 +1,12 @@
 """Memory of this machine: how much is free, how much was used, and sizes as people write them."""
 
+import math
 import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchdeform.errors import InputError
+from torchdeform.errors import InputError, shown
 
 if TYPE_CHECKING:
     import torch
@@ -88,13 +89,19 @@ def parse_size(text: str) -> int:
         InputError: no such size, or none at all.
     """
     found = _SIZE.fullmatch(text)
-    size = round(float(found[1]) * _UNITS[(found[2] or "").lower()]) if found else 0
-    if size <= 0:
-        raise InputError(f"a size of memory is a number with a unit, such as 4GB or 512MB, got '{text}'")
-    return size
+    size = float(found[1]) * _UNITS[(found[2] or "").lower()] if found else 0
+    if not 0.5 < size < 2**63:
+        raise InputError(f"a size of memory is a number with a unit, such as 4GB or 512MB, got {shown(text)}")
+    return round(size)
 
 
 def readable(size: int, *, spaced: bool = True) -> str:
     """Return a number of bytes with a unit, as ``1.9 GB``; without the space `parse_size` takes it as a setting."""
     exponent = next((e for e in range(4) if size / 1000**e < 999.5), 4)  # 999.5 has three digits no more
     return f"{size / 1000**exponent:.3g}{' ' if spaced else ''}{('B', 'kB', 'MB', 'GB', 'TB')[exponent]}"
+
+
+def at_least(size: int) -> str:
+    """Return a number of bytes as `parse_size` takes it, with three digits and not less than ``size``."""
+    text = readable(size, spaced=False)
+    return text if parse_size(text) >= size else readable(math.ceil(1.005 * size), spaced=False)

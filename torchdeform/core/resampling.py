@@ -3,13 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
+from torchdeform.core.tables import kept
 
 # Factor by which voxels grow until a grid has few enough nodes.
 _COARSER = 1.05
@@ -77,10 +78,10 @@ class Banded:
 
 def _lines(field: Tensor, axis: int) -> Tensor:
     """Return a view ``(n, size, m)`` of a field with ``size`` nodes along the axis."""
-    size = field.shape[axis]
+    before, size, after = math.prod(field.shape[:axis]), field.shape[axis], math.prod(field.shape[axis + 1 :])
     if axis == field.dim() - 1:
-        return field.view(-1, size).T.unsqueeze(0)
-    return field.view(math.prod(field.shape[:axis]), size, -1)
+        return field.view(before, size).T.unsqueeze(0)
+    return field.view(before, size, after)
 
 
 def multiply(field: Tensor, factors: Sequence[Banded | None]) -> Tensor:
@@ -118,15 +119,14 @@ def hat_average(field: Tensor, coarse: Grid) -> Tensor:
     return multiply(field, [_hats(many, few, field.dtype, field.device) for many, few in counts])
 
 
-@lru_cache(maxsize=64)
+@kept(64)
 def _hats(fine: int, coarse: int, dtype: torch.dtype, device: torch.device) -> Banded | None:
     """Return the transpose of linear interpolation, every row divided by its sum."""
     if coarse == fine:
         return None
-    with torch.inference_mode(False), torch.no_grad():
-        columns, rows, values = _linear(coarse, fine)
-        sums = values.new_zeros(coarse).index_add_(0, rows, values)
-        return banded(rows, columns, values / sums[rows], (coarse, fine), torch.empty(0, dtype=dtype, device=device))
+    columns, rows, values = _linear(coarse, fine)
+    sums = values.new_zeros(coarse).index_add_(0, rows, values)
+    return banded(rows, columns, values / sums[rows], (coarse, fine), torch.empty(0, dtype=dtype, device=device))
 
 
 def restriction(fine: int, coarse: int, blur: float, like: Tensor) -> Banded | None:
@@ -142,7 +142,7 @@ def restriction(fine: int, coarse: int, blur: float, like: Tensor) -> Banded | N
         return None
     sigma = blur * (fine - 1) / (coarse - 1)
     radius = math.ceil(_REACH * sigma)
-    offset = torch.arange(-radius, radius + 1)
+    offset = torch.arange(-radius, radius + 1, device="cpu")
     kernel = torch.softmax(-(offset.double() ** 2) / (2 * sigma**2), dim=0)
     rows, columns, values = (part.unsqueeze(1) for part in _linear(fine, coarse))
     columns, values = (columns + offset).clamp(0, fine - 1), values * kernel
@@ -152,7 +152,7 @@ def restriction(fine: int, coarse: int, blur: float, like: Tensor) -> Banded | N
 
 def _linear(given: int, asked: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return rows, columns and values of linear interpolation from so many nodes of an interval to others."""
-    rows = torch.arange(asked)
+    rows = torch.arange(asked, device="cpu")
     place = rows.double() * ((given - 1) / (asked - 1))
     left = place.long().clamp(max=given - 2)
     share = place - left
@@ -229,17 +229,16 @@ def _at_centres(x: Tensor, axis: int, stride: int) -> Tensor:
     return x[(slice(None),) * axis + (slice(first, None, stride),)]
 
 
-@lru_cache(maxsize=64)
+@kept(64)
 def _windows(size: int, window: int, stride: int, dtype: torch.dtype, device: torch.device) -> tuple[Banded, Banded]:
     """Return the matrix of ones where the window of a row holds the node of a column, and its transpose."""
-    with torch.inference_mode(False), torch.no_grad():
-        like = torch.empty(0, dtype=dtype, device=device)
-        middle = _at_centres(torch.arange(size), 0, stride).unsqueeze(1)
-        nodes = middle + torch.arange(window) - window // 2
-        inside = (nodes >= 0) & (nodes < size)
-        rows, columns = torch.arange(len(middle)).unsqueeze(1).expand_as(nodes)[inside], nodes[inside]
-        ones, count = torch.ones(len(rows)), len(middle)
-        return banded(rows, columns, ones, (count, size), like), banded(columns, rows, ones, (size, count), like)
+    like = torch.empty(0, dtype=dtype, device=device)
+    middle = _at_centres(torch.arange(size, device="cpu"), 0, stride).unsqueeze(1)
+    nodes = middle + torch.arange(window, device="cpu") - window // 2
+    inside = (nodes >= 0) & (nodes < size)
+    rows, columns = torch.arange(len(middle), device="cpu").unsqueeze(1).expand_as(nodes)[inside], nodes[inside]
+    ones, count = torch.ones(len(rows), dtype=torch.float32, device="cpu"), len(middle)
+    return banded(rows, columns, ones, (count, size), like), banded(columns, rows, ones, (size, count), like)
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.derivatives import jacobian_determinant
-from torchdeform.core.grid import over_slabs
-from torchdeform.core.image import AUTO, Image, outside_value, overlap
+from torchdeform.core.grid import over_slabs, require_float
+from torchdeform.core.image import AUTO, Image, independence, outside_value, overlap
 from torchdeform.core.interpolation import COPYING, LABEL_MODE, interpolator
-from torchdeform.core.warp import invert, sample
+from torchdeform.core.warp import inside_box, invert, sample
 from torchdeform.errors import InputError
 
 # A displacement that moves the faces of its grid further than this, in voxels, is no map of the grid onto itself.
@@ -40,9 +40,11 @@ class Affine:
         if dim not in (2, 3) or tuple(self.matrix.shape) != (dim, dim) or tuple(self.offset.shape) != (dim,):
             shapes = f"{tuple(self.matrix.shape)} and {tuple(self.offset.shape)}"
             raise InputError(f"Affine: matrix must be (D, D) and offset (D,) with D = 2 or 3, got {shapes}")
+        require_float(self.matrix, "Affine: matrix")
+        require_float(self.offset, "Affine: offset")
         if not bool(self.matrix.isfinite().all() and self.offset.isfinite().all()):
             raise InputError("Affine: matrix and offset must be finite")
-        if float(torch.linalg.det(self.matrix.detach()).abs()) == 0:
+        if independence(self.matrix) == 0:
             raise InputError("Affine: the matrix is singular; it takes a volume to a plane")
 
     @property
@@ -53,7 +55,9 @@ class Affine:
     @classmethod
     def identity(cls, dim: int) -> "Affine":
         """Return x ↦ x in ``dim`` dimensions, float64."""
-        return cls(torch.eye(dim, dtype=torch.float64), torch.zeros(dim, dtype=torch.float64))
+        return cls(
+            torch.eye(dim, dtype=torch.float64, device="cpu"), torch.zeros(dim, dtype=torch.float64, device="cpu")
+        )
 
     def __call__(self, points: Tensor) -> Tensor:
         """Return M x + t for points ``(B, D, *T)``, in their type and on their device."""
@@ -85,7 +89,7 @@ class Affine:
 
 def place_of(image: Image) -> Image:
     """Return an image with the same grid and place, but zeros that take no memory as pixels."""
-    nothing = torch.zeros(()).expand(1, 1, *image.grid.shape)
+    nothing = torch.zeros((), dtype=torch.float32, device="cpu").expand(1, 1, *image.grid.shape)
     return replace(image, data=nothing)
 
 
@@ -96,16 +100,15 @@ class Displacement:
     Args:
         field: an image whose ``data`` is u ``(1, D, *S)``: array order, units of spacing; d is u in world axes.
         known_inverse: the field of the inverse map, on any grid, where it is known.
+        margin: how far around its nodes, in voxels, the field goes on with its nearest values; half a voxel in ITK.
 
     Raises:
         InputError: not one displacement, not D components, or an inverse of another dimension.
-
-    Notes:
-        Outside means more than half a voxel outside the grid, as in ITK.
     """
 
     field: Image
     known_inverse: Image | None = None
+    margin: float = 0.5
 
     def __post_init__(self) -> None:
         for image in (self.field, self.known_inverse or self.field):
@@ -123,8 +126,9 @@ class Displacement:
     def __call__(self, points: Tensor) -> Tensor:
         """Return x + d(x) for world points ``(B, D, *T)``, in their type and on their device."""
         where = self.field.to_grid(points.double())
-        u = sample(self.field.data.to(points.device), where, self.field.grid, outside=0.0)
-        return self.field.to_world(where + u).to(points.dtype)
+        u = sample(self.field.data.to(points.device), where, self.field.grid)
+        inside = inside_box(where, self.field.grid, self.margin)
+        return self.field.to_world(where + torch.where(inside, u, 0.0)).to(points.dtype)
 
     def undo(self) -> "tuple[Stage, ...]":
         """Return the stages of the inverse map: the known one, or else one found by Newton's method at every node.
@@ -152,7 +156,7 @@ class Displacement:
 
     def to(self, device: torch.device | str) -> "Displacement":
         """Return the same map with its fields on ``device``."""
-        return Displacement(self.field.to(device), self.known_inverse and self.known_inverse.to(device))
+        return Displacement(self.field.to(device), self.known_inverse and self.known_inverse.to(device), self.margin)
 
 
 def _leak(field: Image) -> float:
@@ -272,9 +276,10 @@ class Transform:
         """
         rows = points.dim() == 2
         columns = points.T.unsqueeze(0) if rows else points
-        if columns.dim() < 3 or columns.shape[1] != self.dim or not points.is_floating_point():
-            given = f"{tuple(points.shape)} of {points.dtype}"
-            raise InputError(f"points must be floating-point (N, {self.dim}) or (B, {self.dim}, *T), got {given}")
+        require_float(points, "points")
+        if columns.dim() < 3 or columns.shape[1] != self.dim:
+            shapes = f"(N, {self.dim}) or (B, {self.dim}, *T)"
+            raise InputError(f"points must have shape {shapes}, got {tuple(points.shape)}")
         for stage in self.stages:
             columns = stage(columns)
         return columns[0].T if rows else columns

@@ -46,17 +46,15 @@ def average_maps(
         displacements.
     """
     shares = _shares(displacements, weights)
-    log_det, rotation, mean = 0.0, 0.0, 0.0
+    log_det = rotation = mean = torch.zeros((), dtype=torch.float32, device="cpu")
     for index, (u, share) in enumerate(zip(displacements, shares, strict=True)):
         det = jacobian_determinant(u, grid, order)
         det = det.clamp(min=least) if least > 0 else det
         if not bool((det > 0).all()):
             raise InputError(f"average_maps: map {index} folds, its determinant falls to {float(det.min()):g}")
         log_det, rotation, mean = log_det + share * det.log(), rotation + share * curl(u, grid, order), mean + share * u
-    f, g, start = (torch.as_tensor(field) for field in (log_det, rotation, mean))
-    return from_jacobian_and_curl(
-        f.exp(), g, grid, boundary_displacement=start, start=start.detach(), order=order, settings=settings
-    )
+    boundary = {"boundary_displacement": mean, "start": mean.detach()}
+    return from_jacobian_and_curl(log_det.exp(), rotation, grid, **boundary, order=order, settings=settings)
 
 
 def _shares(displacements: Sequence[Tensor], weights: Sequence[float] | None) -> list[float]:

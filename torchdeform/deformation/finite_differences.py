@@ -131,7 +131,7 @@ class Differences:
 def _symbol(grid: Grid, axis: int, order: int, like: Tensor) -> Tensor:
     """Return s_j of the inner kernel, ``(n,)``; 1 at both ends, where sines vanish."""
     interior, n = KERNELS[order][0], grid.shape[axis]
-    theta = torch.arange(n, dtype=torch.float64) * (math.pi / (n - 1))
+    theta = torch.arange(n, dtype=torch.float64, device="cpu") * (math.pi / (n - 1))
     half = len(interior) // 2
     symbol = sum((2 * interior[half + k] * torch.sin(k * theta) for k in range(1, half + 1)), torch.zeros_like(theta))
     symbol = symbol / grid.spacing[axis]

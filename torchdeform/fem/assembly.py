@@ -46,7 +46,8 @@ def assemble(form: Form, grid: Grid, device: torch.device | str = "cpu") -> Tens
     column = (number.view(1, 1, -1, 1) * nodes + node.view(1, -1, 1, 1) + shift).expand_as(known)[known]
     entries = values.flatten(3).permute(0, 3, 1, 2)[known]
     size = (count * nodes, count * nodes)
-    return torch.sparse_coo_tensor(torch.stack([row, column]), entries, size, is_coalesced=True, check_invariants=False)
+    place, index = {"size": size, "device": entries.device}, torch.stack([row, column])
+    return torch.sparse_coo_tensor(index, entries, **place, is_coalesced=True, check_invariants=False)
 
 
 def _by_neighbours(form: Form, grid: Grid, device: torch.device | str) -> Tensor:
@@ -91,4 +92,5 @@ def constrain_matrix(matrix: Tensor, fixed: Tensor) -> Tensor:
     given = flat.nonzero().T.expand(2, -1)
     index = torch.cat([matrix.indices()[:, keep], given], dim=1)
     values = torch.cat([matrix.values()[keep], matrix.values().new_ones(given.shape[1])])
-    return torch.sparse_coo_tensor(index, values, matrix.shape, check_invariants=False).coalesce()
+    whole = torch.sparse_coo_tensor(index, values, matrix.shape, device=values.device, check_invariants=False)
+    return whole.coalesce()

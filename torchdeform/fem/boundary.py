@@ -67,7 +67,7 @@ def normal_is_given(boundary: Boundary, dim: int) -> bool:
     return all(fixes(kinds, face, face.axis) for face in faces(dim))
 
 
-def fixed_unknowns(boundary: Boundary, grid: Grid, device: torch.device | str | None = None) -> Tensor:
+def fixed_unknowns(boundary: Boundary, grid: Grid, device: torch.device | str = "cpu") -> Tensor:
     """Return the mask ``(1, D, *S)``, True where a component is given by the boundary conditions.
 
     Args:

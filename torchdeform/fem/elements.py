@@ -4,12 +4,12 @@ Corners and Gauss points of an element are numbered like ``itertools.product((0,
 """
 
 import math
-from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
+from torchdeform.core.tables import kept
 from torchdeform.fem.form import Coefficient, Form, Row
 
 # With N_0 = 1 − x, N_1 = x on an interval of length h: whether the test and the trial function are differentiated
@@ -30,16 +30,15 @@ INTERVAL: dict[tuple[bool, bool], tuple[Matrix, int]] = {
 GAUSS = (0.5 - math.sqrt(1 / 12), 0.5 + math.sqrt(1 / 12))
 
 
-@lru_cache(maxsize=64)
+@kept(64)
 def gauss_table(axis: int | None, spacing: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return ∂_axis N_i (N_i for None) at the Gauss points q, ``(2^D, 2^D)``, entry [q, i]. Not to be written to."""
-    with torch.inference_mode(False), torch.no_grad():
-        values = torch.tensor([[1 - x, x] for x in GAUSS], dtype=torch.float64)
-        slopes = torch.tensor([[-1.0, 1.0]] * len(GAUSS), dtype=torch.float64)
-        product = torch.ones(1, 1, dtype=torch.float64)
-        for a, h in enumerate(spacing):
-            product = torch.kron(product, slopes / h if a == axis else values)
-        return product.to(dtype=dtype, device=device)
+    values = torch.tensor([[1 - x, x] for x in GAUSS], dtype=torch.float64, device="cpu")
+    slopes = torch.tensor([[-1.0, 1.0]] * len(GAUSS), dtype=torch.float64, device="cpu")
+    product = torch.ones(1, 1, dtype=torch.float64, device="cpu")
+    for a, h in enumerate(spacing):
+        product = torch.kron(product, slopes / h if a == axis else values)
+    return product.to(dtype=dtype, device=device)
 
 
 def gauss_weight(grid: Grid) -> float:

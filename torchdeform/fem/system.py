@@ -68,7 +68,7 @@ class DivCurlSystem:
         """Return the load with zeros at given unknowns."""
         return load.masked_fill(self.fixed(load.device), 0)
 
-    def fixed(self, device: torch.device | str | None = None) -> Tensor:
+    def fixed(self, device: torch.device | str = "cpu") -> Tensor:
         """Return the mask ``(B or 1, D, *S)`` of the given unknowns."""
         if device not in self._masks:
             faces = fixed_unknowns(self.boundary, self.grid, device)

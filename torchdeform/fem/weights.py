@@ -1,5 +1,6 @@
 """The weights of the div-curl least squares: what a unit of divergence, of rotation and of velocity costs."""
 
+import math
 from dataclasses import dataclass, fields
 
 import torch
@@ -32,7 +33,7 @@ class Weights:
     def __post_init__(self) -> None:
         for name, value in self._items():
             if not isinstance(value, Tensor):
-                _require_range(name, torch.as_tensor(float(value)))
+                _require_range(name, float(value), float(value))
 
     def check(self, grid: Grid) -> None:
         """Raise `InputError` unless shapes fit the elements of ``grid`` and every value is in range."""
@@ -49,7 +50,7 @@ class Weights:
                 raise InputError(
                     f"Weights: {name} must be a number or have shape (B, 1, {want}), got {tuple(value.shape)}"
                 )
-            _require_range(name, value.detach())
+            _require_range(name, *torch.stack(value.detach().aminmax()).tolist())
 
     @property
     def constant(self) -> bool:
@@ -59,16 +60,19 @@ class Weights:
     @property
     def isotropic(self) -> bool:
         """True when w_div = w_curl for certain: tensors that agree while each wants its own gradient do not count."""
-        if not isinstance(self.div, Tensor) and not isinstance(self.curl, Tensor):
-            return self.div == self.curl
-        pair = [torch.as_tensor(w) for w in (self.div, self.curl)]
-        known = not any(w.requires_grad for w in pair) and pair[0].numel() == pair[1].numel()
-        return self.div is self.curl or (known and bool((pair[0] == pair[1]).all()))
+        if self.div is self.curl:
+            return True
+        tensors = [w for w in (self.div, self.curl) if isinstance(w, Tensor)]
+        sizes = {w.numel() if isinstance(w, Tensor) else 1 for w in (self.div, self.curl)}
+        if len(sizes) > 1 or any(w.requires_grad for w in tensors):
+            return False
+        same = self.div == self.curl
+        return bool(same.all()) if isinstance(same, Tensor) else same
 
     @property
     def zero_positive(self) -> bool:
         """True when w_zero > 0 everywhere."""
-        return bool((torch.as_tensor(self.zero) > 0).all())
+        return bool((self.zero > 0).all()) if isinstance(self.zero, Tensor) else self.zero > 0
 
     def mean(self) -> "Weights":
         """Return the weights averaged over the elements of each batch item."""
@@ -98,8 +102,8 @@ def _mean(weight: Weight) -> Weight:
     return weight.mean(dim=tuple(range(1, weight.dim())), keepdim=True)
 
 
-def _require_range(name: str, value: Tensor) -> None:
-    least = value.min()
-    if not bool(torch.isfinite(value).all()) or bool(least < 0) or (name != "zero" and bool(least == 0)):
+def _require_range(name: str, least: float, greatest: float) -> None:
+    large_enough = least >= 0 if name == "zero" else least > 0  # NaN is not
+    if not large_enough or not greatest < math.inf:
         wanted = "finite and at least 0" if name == "zero" else "finite and positive"
-        raise InputError(f"Weights: {name} must be {wanted}, got {float(least):g}")
+        raise InputError(f"Weights: {name} must be {wanted}, got {greatest if large_enough else least:g}")

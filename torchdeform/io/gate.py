@@ -37,9 +37,9 @@ def require_file(path: Path, what: str = "file", *, folder: bool = False) -> Non
     mode = _mode(path, what)
     if stat.S_ISDIR(mode):
         if not folder:
-            raise InputError(f"{path} is a folder; give {_article(what)}")
+            raise InputError(f"{path} is a folder; give {article(what)}")
     elif not stat.S_ISREG(mode):
-        raise InputError(f"{path} is no file but a device or a pipe; give {_article(what)}")
+        raise InputError(f"{path} is no file but a device or a pipe; give {article(what)}")
     try:
         if stat.S_ISDIR(mode):
             os.scandir(path).close()
@@ -82,7 +82,8 @@ def require_name(path: Path, what: str = "file") -> None:
         raise InputError(f"{shown!r} is a name that other programs cannot read; rename the {what}")
 
 
-def _article(what: str) -> str:
+def article(what: str) -> str:
+    """Return ``a file`` or ``an image``."""
     return f"{'an' if what[0] in 'aeiou' else 'a'} {what}"
 
 
@@ -102,15 +103,15 @@ def read_text(path: Path, what: str = "text file", *, legacy: bool = False) -> s
         content = file.read(LONGEST_TEXT + 1)
     if len(content) > LONGEST_TEXT:
         raise InputError(
-            f"{path} is larger than {readable(LONGEST_TEXT)}, too large for {_article(what)}; check the name"
+            f"{path} is larger than {readable(LONGEST_TEXT)}, too large for {article(what)}; check the name"
         )
     coding = next((name for mark, name in _MARKS.items() if content.startswith(mark)), "utf-8")
     try:
         text = _decode(content, coding, legacy)
     except UnicodeError as error:
-        raise InputError(f"{path} is no text; give {_article(what)} in UTF-8") from error
+        raise InputError(f"{path} is no text; give {article(what)} in UTF-8") from error
     if "\0" in text:
-        raise InputError(f"{path} is no text, it has zero bytes; give {_article(what)} in UTF-8")
+        raise InputError(f"{path} is no text, it has zero bytes; give {article(what)} in UTF-8")
     return text
 
 
@@ -123,21 +124,25 @@ def _decode(content: bytes, coding: str, legacy: bool) -> str:
         return content.decode("cp1252")
 
 
-def require_room(path: Path, needed: int, *, held: int | None = None, remedy: str = CROP) -> None:
+def require_room(
+    path: Path, needed: int, *, stored: int | None = None, held: int | None = None, remedy: str = CROP
+) -> None:
     """Raise `InputError` unless the ``needed`` bytes that the header of ``path`` announces can be there and fit.
 
     Args:
-        path: the file.
+        path: the file of the header.
         needed: bytes of its pixels.
+        stored: bytes of the files that hold them; those of ``path`` by default.
         held: bytes that reading takes, with what the pixels become; ``needed`` by default.
         remedy: what to do where they are too many.
 
     Notes:
         Nothing that deflate packed becomes more than 1032 times as long, and other packings of pixels stay below.
     """
+    stored = path.stat().st_size if stored is None else stored
     held = needed if held is None else held
     announced = max(needed, held // _GROWTH)
-    if announced > max(_SMALL, _DENSEST * path.stat().st_size):
+    if announced > max(_SMALL, _DENSEST * stored):
         raise InputError(f"{path} announces {readable(announced)} of pixels, far more than it can hold; it {DAMAGED}")
     free = available()
     if free is not None and held > free:

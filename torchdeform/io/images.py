@@ -1,26 +1,25 @@
 """Reading and writing images with their exact position in the world; labels keep every value and their type."""
 
-import gzip
 import os
-import shutil
 import tempfile
-import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import dicom, itk
+from torchdeform.io.dicom_header import may_be_dicom
 from torchdeform.io.files import atomic_folder, is_tiff, suffix
-from torchdeform.io.gate import DAMAGED
+from torchdeform.io.gate import require_file
+from torchdeform.io.kinds import GZIP, kind_of
+from torchdeform.io.packed import unpack
 from torchdeform.io.pictures import is_picture, picture_size, read_picture
 from torchdeform.io.tiff import can_page, read_tiff, tiff_size, write_tiff
-from torchdeform.io.validation import NOT_SQUARE, other_kind, require_sound
+from torchdeform.io.volumes import read_volume, volume_size
 
 
 @dataclass(frozen=True)
@@ -54,18 +53,13 @@ FORMATS: dict[str, Format] = {
 _PICTURES = (".gif", ".webp", ".jp2", ".j2k")
 _SLIDES = (".svs", ".ndpi", ".scn", ".bif", ".qptiff", ".lsm", ".btf", ".tf8")
 
-# What the readers of ITK say about a file that is cut off, each in its own words.
-_DAMAGE_SIGNS = ("fread got only", "inflate", "Cannot read requested file", "unexpected end")
-
-# Types whose values float32, in which images are read, cannot all represent.
-_WIDE = ("int32", "uint32", "int64", "uint64", "float64")
-
 
 def read_image(path: str | os.PathLike[str]) -> Image:
-    """Read a 2D or 3D image: DICOM, NIfTI, MetaImage, NRRD, PNG, JPEG, TIFF, slides and other formats of ITK.
+    """Read a 2D or 3D image: DICOM, NIfTI, MGH, MetaImage, NRRD, PNG, JPEG, TIFF, slides and other formats of ITK.
 
     Args:
-        path: the file, plain or compressed with gzip; a folder with one DICOM series; or one file of a series.
+        path: the file, plain or compressed with gzip; a folder with one DICOM series; or one file of a series. What
+            it holds counts, not its name.
 
     Returns:
         The image: float32 pixels, one or several channels, with origin, spacing and direction (LPS mm) of the file.
@@ -73,8 +67,7 @@ def read_image(path: str | os.PathLike[str]) -> Image:
     Raises:
         InputError: the file is missing, empty, damaged, of an unknown format, has several volumes or complex numbers;
             a header that makes no sense; axes that are not at right angles; a folder without DICOM files or with
-            several series; slices that are missing or double; or a NIfTI file with NaN or infinite voxels, which ITK
-            would read as 0.
+            several series; slices that are missing or double; or a NIfTI file with NaN or infinite voxels.
 
     Notes:
         An axis with one sample is dropped, so a volume of one slice is a 2D image. It keeps its position if it is at a
@@ -83,20 +76,23 @@ def read_image(path: str | os.PathLike[str]) -> Image:
         TIFF and pictures are known by content, whatever their name, and turned and coloured as a viewer shows them. The
         pages of a TIFF are a volume. The dots per inch of a print are no scale, see `tiff_scale.scale`.
     """
-    file = Path(path)
+    return _read(Path(path))
+
+
+def _read(file: Path, *, exact: bool = False) -> Image:
+    """Read by the reader of what the file holds; ``exact`` as in `volume_image`."""
     if file.is_dir():
         return dicom.read_folder(file)
-    require_sound(file)
-    if dicom.is_dicom(file):
+    require_file(file, "image file")
+    if may_be_dicom(file):
         return dicom.read_file(file)
     if is_tiff(file):
-        return read_tiff(file)
+        return read_tiff(file, exact=exact)
     if is_picture(file):
         return read_picture(file)
-    ending = suffix(file)
-    if ending.endswith(".gz") and ending not in FORMATS:
-        return _read_gzip(file)
-    return _read_by_itk(file)
+    if kind_of(file) == GZIP:
+        return _read_gzip(file, exact=exact)
+    return itk.volume_image(read_volume(file), str(file), exact=exact)
 
 
 def read_optional(path: Path | None) -> Image | None:
@@ -104,41 +100,15 @@ def read_optional(path: Path | None) -> Image | None:
     return None if path is None else read_image(path)
 
 
-def _read_gzip(path: Path) -> Image:
-    """Decompress a file into a temporary folder and read it there."""
+def _read_gzip(path: Path, *, exact: bool) -> Image:
+    """Unpack a file into a temporary folder and read it there."""
     with tempfile.TemporaryDirectory() as folder:
-        unpacked = Path(folder) / path.with_suffix("").name
+        unpacked = Path(folder) / (path.name.removesuffix(".gz") or "image")
+        unpack(path, unpacked)
         try:
-            with gzip.open(path) as source, unpacked.open("wb") as target:
-                shutil.copyfileobj(source, target)
-        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-            raise InputError(f"{path} {DAMAGED}") from error
-        try:
-            return replace(read_image(unpacked), name=str(path))
+            return replace(_read(unpacked, exact=exact), name=str(path))
         except InputError as error:
             raise InputError(str(error).replace(str(unpacked), str(path))) from error
-
-
-def _read_by_itk(path: Path) -> Image:
-    try:
-        return itk.to_image(itk.load(path), str(path))
-    except RuntimeError as error:
-        _refuse(path, itk.reason(error))
-
-
-def _refuse(path: Path, reason: str) -> NoReturn:
-    """Say why ITK cannot read the file."""
-    if kind := other_kind(path):
-        raise InputError(f"{path} holds a {kind} file under another name; rename it so that it ends in {kind}")
-    if "orthonormal" in reason:
-        raise InputError(f"{path} {NOT_SQUARE}")
-    if any(sign in reason for sign in _DAMAGE_SIGNS):
-        raise InputError(f"{path} {DAMAGED}")
-    if "allocate memory" in reason:
-        raise InputError(f"{path} is, by its header, larger than the memory here; if it is not, the header is damaged")
-    if "determine ImageIO" in reason:
-        raise InputError(f"{path} is no image of a known format; convert it to PNG, TIFF, NIfTI, MetaImage or NRRD")
-    raise InputError(f"{path} cannot be read ({reason}); export it again, or as another format")
 
 
 def write_image(image: Image, path: str | os.PathLike[str]) -> None:
@@ -217,43 +187,35 @@ def image_size(path: Path) -> tuple[tuple[int, ...], int] | None:
     """Return the shape (z, y, x; without axes of one sample) and the channels of an image file, None if unknown.
 
     Args:
-        path: a file, or a folder of DICOM slices, which are all counted as one series.
+        path: a file, or a folder with a DICOM series.
 
     Notes:
-        Reads no pixels, so the file may still be damaged. Formats that ITK does not know are unknown here.
+        Reads no pixels, so the file may still be damaged. What is packed with gzip is unknown, but for NIfTI and MGH.
     """
-    import SimpleITK as sitk
-
-    files = sorted(p for p in (path.iterdir() if path.is_dir() else [path]) if p.is_file())
-    if files and (is_tiff(files[0]) or is_picture(files[0])):
-        return _picture_size(path) if path.is_file() else None
-    reader = sitk.ImageFileReader()
-
-    def read_header() -> tuple[tuple[int, ...], int]:
-        reader.SetFileName(str(files[0]))
-        reader.ReadImageInformation()
-        return reader.GetSize(), reader.GetNumberOfComponents()
-
-    found = itk.quietly(read_header) if files else None
-    if found is None or isinstance(found, RuntimeError):
-        return None
-    size, channels = found
-    slices = (len(files),) if len(files) > 1 else ()
-    shape = tuple(n for n in (*slices, *size[::-1]) if n > 1)
-    return (shape, channels) if len(shape) in (2, 3) else None
-
-
-def _picture_size(path: Path) -> tuple[tuple[int, ...], int] | None:
-    """Return the shape and channels of a picture or TIFF, None where its header makes no sense."""
     try:
-        shape, channels = tiff_size(path) if is_tiff(path) else picture_size(path)
+        require_file(path, "image file", folder=True)
+        found = _size(path)
     except InputError:  # reading will say why
         return None
-    return (shape, channels) if len(shape) in (2, 3) else None
+    if found is None:
+        return None
+    shape = tuple(n for n in found[0] if n > 1)
+    return (shape, found[1]) if len(shape) in (2, 3) else None
+
+
+def _size(path: Path) -> tuple[tuple[int, ...], int] | None:
+    if path.is_dir() or may_be_dicom(path):
+        return dicom.size(path)
+    if is_tiff(path):
+        return tiff_size(path)
+    if is_picture(path):
+        return picture_size(path)
+    found = volume_size(path)
+    return found and (found[0][::-1], found[1])
 
 
 def read_labels(path: str | os.PathLike[str]) -> Image:
-    """Read a label image: like `read_image`, but volumes in float64 if float32 would merge labels above 2²⁴.
+    """Read a label image: like `read_image`, but in float64 if float32 would merge labels above 2²⁴.
 
     Args:
         path: the file, any format that `read_image` reads.
@@ -264,15 +226,10 @@ def read_labels(path: str | os.PathLike[str]) -> Image:
     Raises:
         InputError: as `read_image`.
     """
-    image = read_image(path)
+    image = _read(Path(path), exact=True)
     if image.data.shape[1] == 3 and bool((image.data == image.data[:, :1]).all()):
-        image = replace(image, data=image.data[:, :1].contiguous())
-    if image.pixel_type not in _WIDE or FORMATS.get(suffix(Path(path))) is not _VOLUME:
-        return image
-    import SimpleITK as sitk
-
-    values = torch.from_numpy(sitk.GetArrayFromImage(itk.load(Path(path))).astype(np.float64))
-    return replace(image, data=values.view(1, *image.grid.shape, -1).movedim(-1, 1).contiguous())
+        return replace(image, data=image.data[:, :1].contiguous())
+    return image
 
 
 def write_labels(image: Image, path: str | os.PathLike[str]) -> None:

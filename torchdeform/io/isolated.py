@@ -17,7 +17,9 @@ T = TypeVar("T")
 _SECONDS, _PER_BYTE = 30.0, 1e-6  # that a reader may take, and more for each byte of the file
 
 
-def isolated(function: Callable[..., T], *arguments: object, path: Path, size: int | None = None) -> T:
+def isolated(
+    function: Callable[..., T], *arguments: object, path: Path, size: int | None = None, seconds: float | None = None
+) -> T:
     """Return ``function(*arguments)``, called in a process of its own that may crash or hang.
 
     Args:
@@ -25,6 +27,7 @@ def isolated(function: Callable[..., T], *arguments: object, path: Path, size: i
         arguments: of the function; they and the answer must allow pickling.
         path: the file that is read, for the sentence.
         size: bytes that are read; by default those of ``path``.
+        seconds: that it may take, 30 by default, and 1 more for each megabyte.
 
     Raises:
         InputError: the process died or took too long.
@@ -34,9 +37,9 @@ def isolated(function: Callable[..., T], *arguments: object, path: Path, size: i
         The process starts with the first call (0.3 s), is kept for the next, and ends with this one. It gets no more
         memory than is free.
     """
-    seconds = _SECONDS + _PER_BYTE * (path.stat().st_size if size is None else size)
+    seconds = (seconds or _SECONDS) + _PER_BYTE * (path.stat().st_size if size is None else size)
     try:
-        return _worker(os.getpid()).call(_limited, available(), function, arguments, timeout=seconds)
+        return _worker(os.getpid()).call(_limited, Path.cwd(), available(), function, arguments, timeout=seconds)
     except WorkerLost as error:
         raise InputError(f"{path} makes its reader crash, so it {DAMAGED}") from error
     except TimeLimit as error:
@@ -51,8 +54,9 @@ def _worker(_process: int) -> Worker:
     return worker
 
 
-def _limited(most: int | None, function: Callable[..., T], arguments: tuple[object, ...]) -> T:
-    """Call a function that may take no more than ``most`` bytes beside what the process has."""
+def _limited(folder: Path, most: int | None, function: Callable[..., T], arguments: tuple[object, ...]) -> T:
+    """Call a function in ``folder`` that may take no more than ``most`` bytes beside what the process has."""
+    os.chdir(folder)
     if most is not None:
         try:
             import resource

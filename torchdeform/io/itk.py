@@ -1,9 +1,8 @@
 """Conversion between tensors (array order z, y, x) and SimpleITK's images (x, y, z, LPS mm); the only place for it."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,76 +12,12 @@ from torch import Tensor
 from torchdeform.core.grid import Grid, slabs
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.io.files import atomic_folder, is_tiff, native_stderr
-from torchdeform.io.gate import DAMAGED
-from torchdeform.io.validation import NOT_SQUARE
+from torchdeform.io.files import atomic_folder, native_stderr
+from torchdeform.io.loading import no_warnings, reason, volume_of
+from torchdeform.io.volume import Volume, held_type, squared
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
-
-# What the libraries below ITK print, instead of raising an error, when a file is cut off.
-_DAMAGE_SIGNS = ("not read completely",)
-
-# How much the columns of a direction matrix may deviate from unit length and right angles.
-_SQUARE = 1e-3
-
-# NIfTI's units of space are the last three bits of this number. ITK gives mm whatever they are.
-_NIFTI_UNITS, _SPACE_BITS, _MICROMETRES = "xyzt_units", 7, 3
-
-_Result = TypeVar("_Result")
-
-
-def load(path: Path, kind: str = "") -> "sitk.Image":
-    """Read a file with SimpleITK. A fourth axis is dropped if it holds only one volume.
-
-    Args:
-        path: the file.
-        kind: name of the reader of ITK, say ``PNGImageIO``; by default ITK chooses by the name of the file.
-
-    Raises:
-        InputError: the file is cut off, holds a series, or is a TIFF, at which ITK may crash: see `tiff`.
-        RuntimeError: ITK cannot read it, in ITK's own words; the caller may try another reader.
-    """
-    import SimpleITK as sitk
-
-    if is_tiff(path):
-        raise InputError(f"{path} is a TIFF, which cannot hold what is needed here; convert it to .nii.gz")
-    reader = sitk.ImageFileReader()
-    reader.SetFileName(str(path))
-    reader.SetImageIO(kind)
-    with native_stderr(stdout=True) as printed, _no_warnings():
-        image = _execute(reader)
-    if any(sign in line for line in printed for sign in _DAMAGE_SIGNS):
-        raise InputError(f"{path} {DAMAGED}")
-    if isinstance(image, RuntimeError):
-        raise image
-    return image
-
-
-def _execute(reader: "sitk.ImageFileReader") -> "sitk.Image | RuntimeError":
-    """Read the reader's file, a series of one volume as that volume. ITK's error is returned, not raised."""
-    try:
-        reader.ReadImageInformation()
-        size = reader.GetSize()
-        if max(size[3:], default=1) > 1:
-            file, frame = reader.GetFileName(), "[:, :, :, 0]" if len(size) == 4 else "[:, :, :, 0, 0]"
-            raise InputError(
-                f"{file} is a series of {math.prod(size[3:])} volumes, size {size}; take one out and give that: "
-                f'SimpleITK.WriteImage(SimpleITK.ReadImage("{file}"){frame}, "frame.nii.gz")'
-            )
-        reader.SetExtractSize([*size[:3], *[0] * len(size[3:])])
-        return reader.Execute()
-    except RuntimeError as error:
-        return error
-
-
-def quietly(work: Callable[[], _Result]) -> "_Result | RuntimeError":
-    """Return what ``work`` returns, or the error that it raises. What ITK prints is dropped."""
-    with native_stderr(), _no_warnings():
-        try:
-            return work()
-        except RuntimeError as error:
-            return error
 
 
 def save(image: "sitk.Image", path: Path) -> None:
@@ -93,81 +28,58 @@ def save(image: "sitk.Image", path: Path) -> None:
     """
     import SimpleITK as sitk
 
-    try:
-        with atomic_folder(path.parent) as folder, native_stderr(), _no_warnings():
+    with atomic_folder(path.parent) as folder, native_stderr(), no_warnings():
+        try:
             sitk.WriteImage(image, str(folder / path.name), useCompression=True)
-    except RuntimeError as error:
-        raise InputError(f"{path.name} cannot be written: {reason(error)}; choose another format or folder") from error
-
-
-def reason(error: RuntimeError) -> str:
-    """Return the last line of an error message of ITK, without memory addresses."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1].rpartition("): ")[2].removeprefix("sitk::ERROR: ").rstrip(". ")
-
-
-class _no_warnings:
-    """Switch the warnings of ITK off inside the block."""
-
-    def __enter__(self) -> None:
-        import SimpleITK as sitk
-
-        self.before = sitk.ProcessObject.GetGlobalWarningDisplay()
-        sitk.ProcessObject.SetGlobalWarningDisplay(False)
-
-    def __exit__(self, *_: object) -> None:
-        import SimpleITK as sitk
-
-        sitk.ProcessObject.SetGlobalWarningDisplay(self.before)
+        except RuntimeError as error:
+            said = f"{path.name} cannot be written: {reason(error)}; choose another format or folder"
+            raise InputError(said) from error
 
 
 def to_image(itk: "sitk.Image", name: str) -> Image:
-    """Return a SimpleITK image as an `Image` with float32 pixels, without axes of one sample.
+    """Return a SimpleITK image as `volume_image` does."""
+    return volume_image(volume_of(itk), name)
+
+
+def volume_image(volume: Volume, name: str, *, exact: bool = False) -> Image:
+    """Return a volume as an `Image` with float32 pixels, without axes of one sample.
+
+    Args:
+        volume: what a reader found.
+        name: of the image.
+        exact: whether the pixels become float64 where float32 would merge values of their type.
 
     Notes:
         A slice of a volume becomes a 2D image. It keeps its position if it is at a right angle to the dropped world
         axis. An oblique slice gets the coordinates of its own plane: distances along its rows and columns.
+        Directions that were rounded are replaced by the nearest at right angles.
     """
-    import SimpleITK as sitk
-
-    values = sitk.GetArrayFromImage(itk)
+    values = volume.values
     if np.iscomplexobj(values):
         raise InputError(f"{name} holds complex numbers; save their magnitude and give that")
-    _require_square(itk, name)
-    origin, direction, spacing = _drop_single_axes(itk)
-    channels = itk.GetNumberOfComponentsPerPixel()
-    shape = tuple(n for n in reversed(itk.GetSize()) if n > 1)
+    origin, direction, spacing = _drop_single_axes(volume, squared(volume.direction, name))
+    shape = tuple(n for n in volume.size[::-1] if n > 1)
     if len(shape) < 2:
-        raise InputError(f"{name} has size {list(itk.GetSize())}; give an image with at least two axes")
-    data = torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32).reshape(1, *shape, channels))
+        raise InputError(f"{name} has size {list(volume.size)}; give an image with at least two axes")
+    kind = held_type(values.dtype, exact=exact)
+    with np.errstate(over="ignore"):
+        data = torch.from_numpy(np.ascontiguousarray(values, dtype=kind).reshape(1, *shape, values.shape[-1]))
     grid = Grid(shape, tuple(reversed(spacing)))
     rows = tuple(tuple(map(float, row)) for row in direction)
-    return Image(data.movedim(-1, 1).contiguous(), grid, tuple(origin), rows, name, values.dtype.name, _unit(itk))
+    data = data.movedim(-1, 1).contiguous()
+    return Image(data, grid, tuple(origin), rows, name, values.dtype.name, volume.unit, volume.remarks)
 
 
-def _unit(itk: "sitk.Image") -> str:
-    """Return the unit to show lengths in: µm for NIfTI files that say so."""
-    code = itk.GetMetaData(_NIFTI_UNITS) if itk.HasMetaDataKey(_NIFTI_UNITS) else ""
-    return "µm" if code.isdigit() and int(code) & _SPACE_BITS == _MICROMETRES else "mm"
-
-
-def _require_square(itk: "sitk.Image", name: str) -> None:
-    """Raise `InputError` unless the axes are at right angles: MetaImage and NRRD can hold any matrix."""
-    axes = np.array(itk.GetDirection()).reshape(itk.GetDimension(), -1)
-    if np.abs(axes.T @ axes - np.eye(len(axes))).max() > _SQUARE:
-        raise InputError(f"{name} {NOT_SQUARE}")
-
-
-def _drop_single_axes(itk: "sitk.Image") -> tuple[list[float], NDArray[np.float64], list[float]]:
+def _drop_single_axes(
+    volume: Volume, direction: NDArray[np.float64]
+) -> tuple[list[float], NDArray[np.float64], list[float]]:
     """Return origin, direction and spacing of the axes (x, y, z) that have more than one sample."""
-    dim = itk.GetDimension()
-    keep = [k for k in range(dim) if itk.GetSize()[k] > 1]
-    drop = [k for k in range(dim) if k not in keep]
-    origin, direction = np.array(itk.GetOrigin()), np.array(itk.GetDirection()).reshape(dim, dim)
-    columns = direction[:, keep]
+    keep = [k for k, n in enumerate(volume.size) if n > 1]
+    drop = [k for k, n in enumerate(volume.size) if n == 1]
+    columns, spacing = direction[:, keep], [volume.spacing[k] for k in keep]
     if np.abs(columns[drop]).max(initial=0.0) < 1e-5:
-        return [float(origin[k]) for k in keep], columns[keep], [itk.GetSpacing()[k] for k in keep]
-    return list(map(float, columns.T @ origin)), np.eye(len(keep)), [itk.GetSpacing()[k] for k in keep]
+        return [float(volume.origin[k]) for k in keep], columns[keep], spacing
+    return list(map(float, columns.T @ np.array(volume.origin))), np.eye(len(keep)), spacing
 
 
 def from_values(values: NDArray[np.generic], place: Image) -> "sitk.Image":

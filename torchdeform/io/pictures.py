@@ -18,6 +18,7 @@ from torchdeform.errors import InputError
 from torchdeform.io import itk
 from torchdeform.io.files import native_stderr, read_head
 from torchdeform.io.gate import DAMAGED, reading, require_room
+from torchdeform.io.loading import load
 
 UNREADABLE = "cannot be read as an image; it may be damaged: export it again"
 
@@ -151,7 +152,7 @@ def _orientation(picture: Picture.Image) -> int:
 def _by_itk(path: Path, reader: str) -> Image | None:
     """Return what ITK reads, None where it refuses (for instance grey with alpha)."""
     try:
-        return itk.to_image(itk.load(path, reader), str(path))
+        return itk.to_image(load(path, reader), str(path))
     except RuntimeError:
         return None
 

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,6 +19,7 @@ from torchdeform.errors import InputError
 from torchdeform.io.gate import CROP, DAMAGED, reading, require_beside, require_room
 from torchdeform.io.tiff_pixels import orientation_of, require_colours, shown, unpacked
 from torchdeform.io.tiff_scale import Scale, scale
+from torchdeform.io.volume import held_type
 
 if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPageSeries
@@ -45,11 +46,12 @@ _KEPT = 4  # bytes of a number of float32, which all become
 _TYPES = ("uint8", "uint16", "float32")  # of ImageJ
 
 
-def read_tiff(path: Path) -> Image:
+def read_tiff(path: Path, *, exact: bool = False) -> Image:
     """Read a TIFF: one page as a 2D image, pages as a volume, a slide at its full size.
 
     Args:
         path: the file.
+        exact: whether the pixels become float64 where float32 would merge values of their type.
 
     Raises:
         InputError: damaged, larger than what is free, packed or coloured in a way that is unknown here, pages of
@@ -70,7 +72,7 @@ def read_tiff(path: Path) -> Image:
         pixels = shown(_ordered(axes, values), page)
         if orientation_of(page) > 4:
             found = ((found[0][0], found[0][2], found[0][1]), found[1])
-        return _image(pixels, found, str(path))
+        return _image(pixels, found, str(path), held_type(pixels.dtype, exact=exact))
 
 
 def tiff_size(path: Path) -> tuple[tuple[int, ...], int]:
@@ -212,13 +214,13 @@ def _ordered(axes: str, values: NDArray[np.generic]) -> NDArray[np.generic]:
     return ordered.reshape(channels, -1, *ordered.shape[-2:])
 
 
-def _image(pixels: NDArray[np.generic], found: Scale, name: str) -> Image:
+def _image(pixels: NDArray[np.generic], found: Scale, name: str, held: np.dtype[Any]) -> Image:
     """Return pixels ``(C, Z, Y, X)`` as an image without axes of one sample."""
     used = [k for k in range(3) if pixels.shape[k + 1] > 1]
     if len(used) < 2:
         raise InputError(f"{name} has size {list(pixels.shape[1:])}; give an image with at least two axes")
     (spacing, unit), shape = found, tuple(pixels.shape[k + 1] for k in used)
-    data = torch.from_numpy(np.ascontiguousarray(pixels, dtype=np.float32).reshape(1, -1, *shape))
+    data = torch.from_numpy(np.ascontiguousarray(pixels, dtype=held).reshape(1, -1, *shape))
     kind = "uint8" if pixels.dtype.kind == "b" else pixels.dtype.name
     return Image(data, Grid(shape, tuple(spacing[k] for k in used)), name=name, pixel_type=kind, unit=unit)
 

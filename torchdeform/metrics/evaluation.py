@@ -124,7 +124,7 @@ def _measures(regions: _Pair | None, pairs: _Pair | None, grid: Grid, original: 
     """Return the measures of regions and of points; the labels are those that both images had at first."""
     distances = pairs and landmark_distances(pairs[0].double(), pairs[1].to(pairs[0].device).double())
     if regions is None or original is None:
-        empty = torch.empty(0, 0, dtype=torch.float64)
+        empty = torch.empty(0, 0, dtype=torch.float64, device="cpu")
         return Measures((), empty, empty, distances)
     labels = common_labels(*original)
     return Measures(labels, dice(*regions, labels), hausdorff(*regions, labels, grid), distances)
@@ -167,7 +167,7 @@ def dice(fixed: Tensor, warped: Tensor, labels: tuple[int, ...]) -> Tensor:
     """
     _require_same(fixed, warped, "dice")
     parts = [_overlap(fixed == label, warped == label) for label in labels]
-    return torch.stack(parts, dim=1) if parts else torch.empty(len(fixed), 0, dtype=torch.float64)
+    return torch.stack(parts, dim=1) if parts else torch.empty(len(fixed), 0, dtype=torch.float64, device="cpu")
 
 
 def _overlap(a: Tensor, b: Tensor) -> Tensor:
@@ -202,7 +202,7 @@ def hausdorff(
         [_surface_distance(a[0] == label, b[0] == label, grid, percentile) for label in labels]
         for a, b in zip(fixed.cpu(), warped.cpu(), strict=True)
     ]
-    return torch.tensor(rows, dtype=torch.float64).view(len(fixed), len(labels))
+    return torch.tensor(rows, dtype=torch.float64, device="cpu").view(len(fixed), len(labels))
 
 
 def _require_same(fixed: Tensor, warped: Tensor, name: str) -> None:

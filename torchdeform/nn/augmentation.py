@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -93,12 +94,13 @@ class RandomDeformation(nn.Module):
 
         Args:
             items: how many, B.
-            like: a tensor of the device wanted, and of the dtype if that is float64; otherwise float32.
+            like: a tensor of the device wanted, and of the dtype if that is float64; float32 on the CPU when None.
             generator: of the CPU; torch's own when None.
         """
-        like = torch.empty(0) if like is None else like
-        dtype = torch.float64 if like.dtype == torch.float64 else torch.float32
-        return RandomMap(self._maps(self._noise(items, generator).to(like.device, dtype)), self.grid)
+        noise = self._noise(items, generator)
+        if like is not None:
+            noise = noise.to(like.device, torch.float64 if like.dtype == torch.float64 else torch.float32)
+        return RandomMap(self._maps(noise), self.grid)
 
     def forward(
         self,
@@ -134,8 +136,9 @@ class RandomDeformation(nn.Module):
         """Return numbers between −1 and 1 for the monitor and the curl, ``(B, 1 + C, *coarse)``, 0 where none moves."""
         longest = max(self.grid.extent)
         shape = [max(2, round(self.nodes * side / longest)) for side in self.grid.extent]
-        noise = 2 * torch.rand(items, 1 + len(CURL_PAIRS[self.grid.dim]), *shape, generator=generator) - 1
-        return noise * per_item(torch.rand(items, generator=generator) < self.probability, noise)
+        kind: dict[str, Any] = {"generator": generator, "dtype": torch.float32, "device": "cpu"}
+        noise = 2 * torch.rand(items, 1 + len(CURL_PAIRS[self.grid.dim]), *shape, **kind) - 1
+        return noise * per_item(torch.rand(items, **kind) < self.probability, noise)
 
     @full_precision
     def _maps(self, noise: Tensor) -> Tensor:

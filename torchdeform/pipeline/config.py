@@ -1,22 +1,21 @@
 """Settings from presets, YAML files and ``key=value`` overrides: typed, and no key unknown."""
 
 import os
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, get_type_hints
 
-from torchdeform.errors import InputError, nearest_name, require_choice
+from torchdeform.errors import InputError, nearest_name, require_choice, shown
+from torchdeform.io.gate import read_text
+from torchdeform.io.texts import Lines, parse_yaml, yaml_lines
 from torchdeform.metrics.similarity import MEASURES
 from torchdeform.registration.settings import SHORT_FORMS, RegistrationSettings
 
 _PRESETS = "presets"
-_MOST_ENTRIES = 300_000  # of a YAML file, those that aliases repeat counted again
-_DEEPEST = 50  # mappings and lists inside one another
-
-Lines = dict[tuple[str | int, ...], int]
+_DEEPEST = 5  # groups of settings inside one another
 
 
 def load_settings(
@@ -70,22 +69,12 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """Return the mapping in a YAML file, empty if there is nothing in it.
 
     Raises:
-        InputError: the file is missing, no YAML, no mapping, or gives a key twice.
+        InputError: the file is missing or no text, what `parse_yaml` refuses, or no mapping.
     """
-    import yaml
-
-    try:
-        content = _load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}; check the name of the settings file") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f" at line {mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "it is no text"
-        raise InputError(f"{path} is no valid YAML{line}: {problem}") from error
+    content = parse_yaml(read_text(path, "YAML file"), str(path))
     if content is None:
         return {}
-    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+    if not isinstance(content, dict):
         raise InputError(f"{path} must hold 'key: value' lines, one setting each")
     return content
 
@@ -96,90 +85,18 @@ def parse_override(text: str) -> tuple[str, object]:
     Raises:
         InputError: no ``=``, or a value that is no YAML.
     """
-    import yaml
-
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
-        raise InputError(f"--set needs key=value, got {text!r}")
+        raise InputError(f"--set needs key=value, got {shown(text)}")
     try:
-        return key.strip(), yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise InputError(f"--set {key.strip()}: {value!r} is no valid value; lists are written [40, 20]") from error
+        return key.strip(), parse_yaml(value, f"--set {shown(key.strip())[1:-1]}: {shown(value)}")
+    except InputError as error:
+        raise InputError(f"{error}; lists are written [40, 20]") from error
 
 
 def read_yaml_lines(path: Path) -> Lines:
-    """Return the line, from 1, of every key and list item of a YAML file, by the keys and positions that lead to it.
-
-    Raises:
-        InputError: aliases that repeat themselves, or each other, without end.
-
-    Notes:
-        For a file that `read_yaml` has read.
-    """
-    import yaml
-
-    lines: Lines = {}
-    whole = yaml.compose(path.read_text(encoding="utf-8"), _safe_loader())
-    open_nodes: list[tuple[tuple[str | int, ...], Any]] = [((), whole)]
-    while open_nodes:
-        keys, node = open_nodes.pop()
-        for key, child, mark in _children(node):
-            if len(lines) + len(open_nodes) > _MOST_ENTRIES or len(keys) > _DEEPEST:
-                raise InputError(f"{path} repeats its aliases too often; write out what they stand for")
-            lines.setdefault((*keys, *key), mark.line + 1)
-            open_nodes.append(((*keys, *key), child))
-    return lines
-
-
-def _children(node: object) -> list[tuple[tuple[str | int, ...], Any, Any]]:
-    """Return key (none for what ``<<`` merges in), node and place of what stands in a YAML mapping or list."""
-    import yaml
-
-    if isinstance(node, yaml.MappingNode):
-        return [(() if key.value == "<<" else (key.value,), value, key.start_mark) for key, value in node.value]
-    if isinstance(node, yaml.SequenceNode):
-        return [((position,), value, value.start_mark) for position, value in enumerate(node.value)]
-    return []
-
-
-def to_yaml(content: Mapping[str, object]) -> str:
-    """Return plain values as YAML text, keys in their order."""
-    import yaml
-
-    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True, width=120)
-
-
-def _safe_loader() -> Any:
-    """Return PyYAML's safe loader, the fast one in C where there is one."""
-    import yaml
-
-    return getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-
-def _load(text: str) -> Any:
-    """Return what a YAML text holds; the slow loader has the better word, and line, for what is wrong."""
-    import yaml
-
-    try:
-        return yaml.load(text, _unique_keys_loader(_safe_loader()))
-    except yaml.YAMLError:
-        return yaml.load(text, _unique_keys_loader(yaml.SafeLoader))
-
-
-def _unique_keys_loader(base: Any) -> type:
-    """Return a safe loader of PyYAML, made to refuse a key that is given twice (it would keep the last in silence)."""
-    import yaml
-
-    class Loader(base):
-        def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-            keys = [self.construct_object(key, deep=deep) for key, _ in node.value]
-            for position, key in enumerate(keys):
-                if key in keys[:position]:
-                    mark = node.value[position][0].start_mark
-                    raise yaml.constructor.ConstructorError(None, None, f"{key} is given twice", mark)
-            return super().construct_mapping(node, deep)
-
-    return Loader
+    """Return the lines of a YAML file that `read_yaml` has read, see `yaml_lines`."""
+    return yaml_lines(read_text(path, "YAML file"), str(path))
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -187,8 +104,8 @@ def nested(values: Mapping[str, Any]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for key, value in values.items():
         if not isinstance(key, str):
-            raise InputError(f"settings: the name of a setting is a text, got {key!r}")
-        *parents, name = key.split(".")
+            raise InputError(f"settings: the name of a setting is a text, got {shown(key)}")
+        *parents, name = key.split(".", _DEEPEST)
         node = {name: value if parents else _whole_group(name, value)}
         for parent in reversed(parents):
             node = {parent: node}
@@ -247,12 +164,13 @@ def _require_known(kind: Any, values: Mapping[str, Any], where: str, prefix: str
     known = [field.name for field in fields(kind)]
     for key, value in values.items():
         if key not in known:
-            raise InputError(f"{where}: there is no setting '{prefix}{key}'{_suggestion(str(key), known, prefix)}")
+            name = shown(f"{prefix}{key}")
+            raise InputError(f"{where}: there is no setting {name}{_suggestion(str(key), known, prefix)}")
         if not is_dataclass(hints[key]):
             continue
         if not isinstance(value, dict):
             inside = ", ".join(field.name for field in fields(hints[key]))
-            raise InputError(f"{where}: {prefix}{key} is a group of settings ({inside}), got {value!r}")
+            raise InputError(f"{where}: {prefix}{key} is a group of settings ({inside}), got {shown(value)}")
         _require_known(hints[key], value, where, f"{prefix}{key}.")
 
 
@@ -283,5 +201,5 @@ def _validate(values: dict[str, Any], sources: Mapping[str, str]) -> Registratio
     inside = [known for known in sources if known.startswith(f"{name}.") and known.rpartition(".")[2] in problem]
     where = next((sources[known] for known in (*inside, name, name.partition(".")[0]) if known in sources), "settings")
     own = first["type"] == "value_error" and isinstance(first["input"], dict)  # of a whole group, with names in it
-    given = "" if own else f"{name} = {first['input']!r}: "
+    given = "" if own else f"{name} = {shown(first['input'])}: "
     raise InputError(f"{where}: {given}{problem}")

@@ -1,6 +1,7 @@
 """One pair of image files: reading and checking, registration, and the folder of results."""
 
-import json
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from time import perf_counter
@@ -18,10 +19,13 @@ from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.io import read_image, write_displacement, write_image, write_transform
 from torchdeform.io.files import atomic_folder, require_writable
 from torchdeform.io.images import ending_like, read_labels, read_optional, require_storable, write_labels
+from torchdeform.io.point_tables import FIXED, MOVING
 from torchdeform.io.points import matched, read_points
+from torchdeform.io.texts import read_json
 from torchdeform.metrics.evaluation import common_labels
-from torchdeform.pipeline.memory import fitting_grid, footprint
-from torchdeform.pipeline.preflight import WARNING, preflight
+from torchdeform.pipeline.annotations import check_labels, check_points
+from torchdeform.pipeline.memory import advice, fitting_grid, footprint
+from torchdeform.pipeline.preflight import WARNING, Finding, Report, preflight
 from torchdeform.registration.deformable import resample_result
 from torchdeform.registration.problem import Annotations
 from torchdeform.registration.result import Callback, RegistrationResult
@@ -38,6 +42,10 @@ RECORD = "result.json"
 REPORT = "report.html"
 OVERVIEW = "overview.png"
 THUMBNAIL = "thumb.jpg"
+DISPLACEMENT, TRANSFORM, INVERSE = "displacement.nii.gz", "transform.h5", "inverse.h5"
+
+_FIXED_NAMES = {RECORD, REPORT, OVERVIEW, THUMBNAIL, DISPLACEMENT, TRANSFORM, INVERSE}
+_WARPED = re.compile(r"warped(_labels)?(\.[A-Za-z0-9]+){1,2}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +134,8 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
         memory: bytes that a coarser grid keeps the registration to, see `preflight`.
 
     Raises:
-        InputError: a file cannot be read, `preflight` finds an error, or the labels do not fit.
+        InputError: a file cannot be read, `preflight` finds an error, or landmarks or labels do not belong to
+            their image.
     """
     files.require_pairs()
     fixed, moving = read_image(files.fixed), read_image(files.moving)
@@ -151,17 +160,32 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
         **_read_points(files, fixed, moving),
     )
     annotations.require_images(fixed.grid.dim)
+    found = Report(tuple(_check_annotations(files, (fixed, moving), annotations)))
+    found.require_ok()
     if labels[0] is not None and labels[1] is not None:  # some must be the same, or nothing can be measured
         first = resample(labels[0], fixed, mode="nearest")
         common_labels(first, labels[1].data, names=(labels[0].name, labels[1].name))
-    return Inputs(fixed, moving, annotations, report.of(WARNING))
+    remarks = [text for image in labels if image is not None for text in image.remarks]
+    return Inputs(fixed, moving, annotations, (*report.of(WARNING), *found.of(WARNING), *remarks))
+
+
+def _check_annotations(files: PairFiles, images: tuple[Image, Image], annotations: Annotations) -> Iterator[Finding]:
+    """Yield what looks wrong with the landmarks and the labels of both images."""
+    for side, image in zip((FIXED, MOVING), images, strict=True):
+        points, labels = (getattr(annotations, f"{side}_{what}") for what in ("points", "labels"))
+        if points is not None:
+            yield from check_points(image, points[0].T, getattr(files, f"{side}_points"))
+        if isinstance(labels, Image):
+            yield from check_labels(image, labels)
 
 
 def _read_points(files: PairFiles, fixed: Image, moving: Image) -> dict[str, Tensor]:
     """Return corresponding landmarks in the world, ``(1, D, n)`` each, by the names that `Annotations` has for them."""
     if files.fixed_points is None or files.moving_points is None:
         return {}
-    first, second, _ = matched(read_points(files.fixed_points, fixed), read_points(files.moving_points, moving))
+    first, second, _ = matched(
+        read_points(files.fixed_points, fixed, side=FIXED), read_points(files.moving_points, moving, side=MOVING)
+    )
     return {"fixed_points": first.T.unsqueeze(0), "moving_points": second.T.unsqueeze(0)}
 
 
@@ -237,7 +261,7 @@ def _fit_to_memory(
         if free is not None and need > free:
             raise InputError(
                 f"{fixed.name}: registering it takes about {readable(need)} of memory and {readable(free)} are free; "
-                f"use --memory {readable(free, spaced=False)} to register it on a coarser grid"
+                f"{advice(fixed.grid, free, channels, settings)}"
             )
         return fixed, ()
     grid = fitting_grid(fixed.grid, memory, channels, settings)
@@ -257,8 +281,7 @@ def _write_results(files: PairFiles, inputs: Inputs, result: RegistrationResult,
     """Write all files of a result into the folder, or none."""
     begin("writing")
     out, start = files.out, perf_counter()
-    earlier = _earlier_files(out)
-    with atomic_folder(out) as folder:
+    with atomic_folder(out, lambda: _earlier_files(out)) as folder:
         _write_images(folder, files, inputs, result)
         written = perf_counter()
         begin("drawing")
@@ -271,8 +294,6 @@ def _write_results(files: PairFiles, inputs: Inputs, result: RegistrationResult,
         if data is not None:
             write_report(folder / REPORT, data, record)
         write_json(record, folder / RECORD)
-    for name in earlier - set(names):
-        (out / name).unlink(missing_ok=True)
     return Outcome(result, record, out)
 
 
@@ -308,9 +329,9 @@ def _write_images(folder: Path, files: PairFiles, inputs: Inputs, result: Regist
     )
     warped = replace(fixed, data=result.warped, name="warped", pixel_type=moving.pixel_type)
     write_image(warped, folder / f"warped{ending_like(files.moving, warped)}")
-    write_displacement(transform.flatten(fixed).field.data, fixed, folder / "displacement.nii.gz")
-    write_transform(transform, folder / "transform.h5")
-    write_transform(transform.inverse(), folder / "inverse.h5")
+    write_displacement(transform.flatten(fixed).field.data, fixed, folder / DISPLACEMENT)
+    write_transform(transform, folder / TRANSFORM)
+    write_transform(transform.inverse(), folder / INVERSE)
     if files.moving_labels is not None and isinstance(inputs.annotations.moving_labels, Image):
         labels = transform.labels(inputs.annotations.moving_labels, fixed)
         write_labels(labels, folder / f"warped_labels{ending_like(files.moving_labels, labels)}")
@@ -319,16 +340,24 @@ def _write_images(folder: Path, files: PairFiles, inputs: Inputs, result: Regist
 def _earlier_record(out: Path) -> dict[str, Any]:
     """Return the record that an earlier run left in ``out``; empty if there is none, or none that can be read."""
     try:
-        record = json.loads((out / RECORD).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        record = read_json(out / RECORD, "record of a registration")
+    except InputError:
         return {}
     return record if isinstance(record, dict) else {}
 
 
+def is_result(name: object) -> bool:
+    """Return whether `register_files` writes files of this name; no others are ever removed."""
+    return isinstance(name, str) and (name in _FIXED_NAMES or _WARPED.fullmatch(name) is not None)
+
+
 def _earlier_files(out: Path) -> set[str]:
     """Return the names that an earlier run recorded in ``out``, so that none of its results stays."""
-    names = _earlier_record(out).get("files")
-    return {n for n in names if isinstance(n, str) and Path(n).name == n} if isinstance(names, list) else set()
+    record = _earlier_record(out)
+    names, made_by = record.get("files"), record.get("versions")
+    if not isinstance(names, list) or not isinstance(made_by, dict) or "torchdeform" not in made_by:
+        return set()
+    return set(filter(is_result, names))
 
 
 def _require_own(files: PairFiles) -> None:

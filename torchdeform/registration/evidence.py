@@ -332,7 +332,7 @@ def otsu(values: Tensor) -> float:
     """Return the threshold that leaves the least variance within the values on either side of it."""
     low, high = (float(end) for end in values.aminmax())
     count = torch.histc(values.float(), 256, min=low, max=high).double()
-    centre = low + (high - low) * (torch.arange(256, dtype=torch.float64) + 0.5) / 256
+    centre = low + (high - low) * (torch.arange(256, dtype=torch.float64, device="cpu") + 0.5) / 256
     below, total = count.cumsum(0), (count * centre).cumsum(0)
     above = below[-1] - below
     between = (total * below[-1] - total[-1] * below).square() / (below * above).clamp(min=1)

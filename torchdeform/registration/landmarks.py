@@ -136,9 +136,8 @@ def _summed(parts: Tensor, nodes: Tensor, grid: Grid) -> Tensor:
     size = math.prod(grid.shape)
     rows = torch.arange(items * channels, device=parts.device).view(items, channels, 1) * size
     index = (rows + nodes.unsqueeze(1)).flatten()
-    total = torch.sparse_coo_tensor(
-        index.unsqueeze(0), parts.flatten(), (items * channels * size,), check_invariants=False
-    )
+    place = {"size": (items * channels * size,), "device": parts.device}
+    total = torch.sparse_coo_tensor(index.unsqueeze(0), parts.flatten(), **place, check_invariants=False)
     return total.coalesce().to_dense().view(items, channels, *grid.shape)
 
 

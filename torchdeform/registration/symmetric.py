@@ -159,9 +159,9 @@ def root(affine: Affine) -> Affine:
         InputError: there is none near the identity: the map turns by half a circle, or mirrors.
     """
     dim = affine.offset.numel()
-    whole = torch.eye(dim + 1, dtype=torch.float64)
+    whole = torch.eye(dim + 1, dtype=torch.float64, device="cpu")
     whole[:dim, :dim], whole[:dim, dim] = affine.matrix.double().cpu(), affine.offset.double().cpu()
-    half, inverse = whole, torch.eye(dim + 1, dtype=torch.float64)
+    half, inverse = whole, torch.eye(dim + 1, dtype=torch.float64, device="cpu")
     for _ in range(_ROOT_STEPS):
         half, inverse = (half + _inverse(inverse)) / 2, (inverse + _inverse(half)) / 2
     if not bool(((half @ half - whole).abs() <= 1e-6 * whole.abs().max()).all()):
@@ -175,8 +175,8 @@ def _inverse(matrix: Tensor) -> Tensor:
 
 def common_axes(fixed: Image, moving: Image) -> Direction:
     """Return the direction matrix of both images if they share it, else that of the world's axes."""
-    first, second = (torch.tensor(image.direction, dtype=torch.float64) for image in (fixed, moving))
-    world = torch.eye(fixed.grid.dim).tolist()
+    first, second = (torch.tensor(image.direction, dtype=torch.float64, device="cpu") for image in (fixed, moving))
+    world = torch.eye(fixed.grid.dim, dtype=torch.float64, device="cpu").tolist()
     return fixed.direction if torch.allclose(first, second, atol=1e-6) else tuple(map(tuple, world))
 
 
@@ -197,7 +197,7 @@ def midspace_frame(fixed: Image, moving: Image, axes: Direction) -> Image:
     low, high = (low.amax(0) - margin).maximum(low.amin(0)), (high.amin(0) + margin).minimum(high.amax(0))
     spacing = torch.stack([_spacing_along(image, origin) for image in (fixed, moving)]).log().mean(0).exp()
     shape = ((high - low) / spacing + 1 + 1e-6).floor()
-    if bool((shape < MIN_NODES).any()):
+    if bool((shape < min(MIN_NODES, *fixed.grid.shape, *moving.grid.shape)).any()):
         raise InputError(f"{fixed.name} and {moving.name} have too little in common; align them first")
     rest = (high - low - (shape - 1) * spacing) / 2
     first = origin.to_world((low + rest).view(1, -1, 1)).flatten().tolist()
@@ -207,7 +207,7 @@ def midspace_frame(fixed: Image, moving: Image, axes: Direction) -> Image:
 
 def _spacing_along(image: Image, place: Image) -> Tensor:
     """Return the width of the image's voxels along the axes of ``place``, in units of the world."""
-    steps = torch.diag(torch.tensor(image.grid.spacing, dtype=torch.float64)).unsqueeze(0)
+    steps = torch.diag(torch.tensor(image.grid.spacing, dtype=torch.float64, device="cpu")).unsqueeze(0)
     moved = place.to_grid(image.to_world(steps)) - place.to_grid(image.to_world(torch.zeros_like(steps)))
     return moved.squeeze(0).norm(dim=1)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchdeform.core.diagnostics import smallest_determinant
 from torchdeform.core.fold_free import largest_share
-from torchdeform.core.grid import per_item
+from torchdeform.core.grid import magnitude, per_item
 from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Transform, place_of
 from torchdeform.core.warp import compose, invert, max_voxels
@@ -299,7 +299,7 @@ def _mean_affine(maps: Sequence[Transform], reference: Image, pose: Pose) -> Aff
     left, sizes, right = torch.linalg.svd(torch.stack([a.matrix.double().cpu() for a in affines]))
     logarithms = right.mT @ torch.diag_embed(sizes.log()) @ right
     matrix = torch.matrix_exp(logarithms.mean(0))
-    half = torch.tensor(reference.grid.extent, dtype=torch.float64).view(1, -1, 1) / 2
+    half = torch.tensor(reference.grid.extent, dtype=torch.float64, device="cpu").view(1, -1, 1) / 2
     middle = reference.to_world(half)
     goal = middle
     if pose == "mean":
@@ -320,7 +320,8 @@ def average_intensities(images: Iterable[Image], *, match: bool = True) -> Image
     Raises:
         InputError: no image, or shapes that do not agree.
     """
-    total, count, levels, first = torch.zeros(()), torch.zeros(()), [], None
+    total = count = torch.zeros((), dtype=torch.float32, device="cpu")
+    levels, first = [], None
     for image in images:
         first = first or image
         if image.data.shape != first.data.shape:
@@ -341,6 +342,9 @@ def average_intensities(images: Iterable[Image], *, match: bool = True) -> Image
 def _level(data: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
     """Return mean and standard deviation of each channel over the nodes that are known, ``(1, C, 1, ..)`` each."""
     axes, nodes = tuple(range(2, data.dim())), known.sum().clamp(min=1)
-    mean = data.where(known, 0.0).sum(axes, keepdim=True) / nodes
+    data = data.where(known, 0.0)
+    scale = magnitude(data)
+    data = data / scale
+    mean = data.sum(axes, keepdim=True) / nodes
     variance = (data - mean).where(known, 0.0).square().sum(axes, keepdim=True) / nodes
-    return mean, variance.sqrt().clamp(min=torch.finfo(data.dtype).tiny)
+    return mean * scale, (variance.sqrt() * scale).clamp(min=torch.finfo(data.dtype).tiny)

@@ -1,13 +1,14 @@
 """Sine and cosine transforms of type I along the axes of a tensor, which diagonalise Q1 elements on a box."""
 
 import math
-from functools import lru_cache
 from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.autograd import Function
 
+from torchdeform.core.grid import over_items
+from torchdeform.core.tables import kept
 from torchdeform.errors import require_choice
 
 Kind = Literal["cosine", "sine"]
@@ -87,13 +88,24 @@ def separable_transform(x: Tensor, kinds: Kinds, *, out: Tensor | None = None) -
 
 class _SeparableTransform(Function):
     @staticmethod
-    def forward(ctx, x: Tensor, kinds: Kinds) -> Tensor:
-        ctx.kinds = kinds
+    def forward(x: Tensor, kinds: Kinds) -> Tensor:
         return _separable(x, kinds, torch.empty_like(x, memory_format=torch.contiguous_format))
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.kinds = inputs[1]
 
     @staticmethod
     def backward(ctx, grad: Tensor):
         return _SeparableTransform.apply(grad, ctx.kinds), None
+
+    @staticmethod
+    def jvp(ctx, tangent: Tensor, _: None) -> Tensor:
+        return _SeparableTransform.apply(tangent, ctx.kinds)
+
+    @staticmethod
+    def vmap(info, in_dims, x: Tensor, kinds: Kinds):
+        return over_items(lambda items: _SeparableTransform.apply(items, kinds), x, in_dims[0]), 0
 
 
 def _separable(x: Tensor, kinds: Kinds, out: Tensor) -> Tensor:
@@ -128,14 +140,13 @@ def _fft_sum(x: Tensor, dim: int, kind: Kind, out: Tensor | None) -> Tensor:
     return sums if out is None else out.copy_(sums)
 
 
-@lru_cache(maxsize=64)
+@kept(64)
 def dense_matrix(size: int, kind: Kind, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Return the symmetric matrix of entries cos(π i j/(n − 1)) or sin(π i j/(n − 1)); shared, not to be written to."""
-    with torch.inference_mode(False), torch.no_grad():
-        node = torch.arange(size)
-        # The phase is reduced in integers: exact zeros at the ends of the sines, full accuracy for long axes.
-        phase = torch.remainder(torch.outer(node, node), 2 * (size - 1)).double() * (math.pi / (size - 1))
-        matrix = phase.cos() if kind == "cosine" else phase.sin()
-        if kind == "sine":
-            matrix[[0, -1]], matrix[:, [0, -1]] = 0.0, 0.0
-        return matrix.to(dtype=dtype, device=device)
+    node = torch.arange(size, device="cpu")
+    # The phase is reduced in integers: exact zeros at the ends of the sines, full accuracy for long axes.
+    phase = torch.remainder(torch.outer(node, node), 2 * (size - 1)).double() * (math.pi / (size - 1))
+    matrix = phase.cos() if kind == "cosine" else phase.sin()
+    if kind == "sine":
+        matrix[[0, -1]], matrix[:, [0, -1]] = 0.0, 0.0
+    return matrix.to(dtype=dtype, device=device)

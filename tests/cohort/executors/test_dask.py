@@ -34,7 +34,7 @@ def test_a_scheduler_that_is_not_there_is_named(jobs, tmp_path, monkeypatch):
     dask = pytest.importorskip("torchdeform.cohort.executors.dask")
     pytest.importorskip("distributed")
     monkeypatch.setattr(dask, "_CONNECT", "0.5s")
-    monkeypatch.setattr(dask, "_measured", lambda jobs: [0] * len(jobs))
+    monkeypatch.setattr(dask, "measure", lambda jobs: [0] * len(jobs))
     settings = EngineSettings(kind="dask", scheduler="tcp://127.0.0.1:1")
     with (
         pytest.raises(EngineError, match=r"tcp://127\.0\.0\.1:1 does not answer"),

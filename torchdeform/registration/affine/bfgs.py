@@ -108,5 +108,5 @@ def _updated(state: _State, step: Tensor, change: Tensor) -> Tensor:
     bent = (state.inverse @ change.unsqueeze(2)).squeeze(2)
     ratio = product / (change * bent).sum(1).clamp(min=1e-30).view(-1, 1, 1)
     inverse = torch.where(state.fresh.view(-1, 1, 1), ratio * state.inverse, state.inverse)
-    left = torch.eye(step.shape[1], dtype=step.dtype) - step.unsqueeze(2) * change.unsqueeze(1) / product
+    left = torch.eye(step.shape[1], dtype=step.dtype, device="cpu") - step.unsqueeze(2) * change.unsqueeze(1) / product
     return left @ inverse @ left.transpose(1, 2) + step.unsqueeze(2) * step.unsqueeze(1) / product

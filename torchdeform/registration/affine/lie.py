@@ -2,10 +2,11 @@
 
 import itertools
 import math
-from functools import cache
 
 import torch
 from torch import Tensor
+
+from torchdeform.core.tables import kept
 
 # What each kind adds to the shifts.
 _LINEAR = {"translation": (), "rigid": ("rotations",), "similarity": ("rotations", "scale"), "affine": ("all",)}
@@ -31,7 +32,7 @@ def generators(kind: str, dim: int) -> Tensor:
 
 
 def _entry(dim: int, values: dict[tuple[int, int], float]) -> Tensor:
-    matrix = torch.zeros(dim, dim + 1, dtype=torch.float64)
+    matrix = torch.zeros(dim, dim + 1, dtype=torch.float64, device="cpu")
     for place, value in values.items():
         matrix[place] = value
     return matrix
@@ -59,12 +60,12 @@ def homogeneous(linear: Tensor, shift: Tensor) -> Tensor:
         shift: ``(D,)``.
     """
     dim = len(shift)
-    matrix = torch.eye(dim + 1, dtype=linear.dtype)
+    matrix = torch.eye(dim + 1, dtype=linear.dtype, device="cpu")
     matrix[:dim, :dim], matrix[:dim, dim] = linear, shift
     return matrix
 
 
-@cache
+@kept(2)
 def rotations(dim: int) -> Tensor:
     """Return rotations that leave no other further than 5° (2D) or 45° (3D) away, the identity first.
 
@@ -75,7 +76,7 @@ def rotations(dim: int) -> Tensor:
 
 
 def _circle() -> Tensor:
-    angles = 2 * math.pi / 36 * torch.arange(36, dtype=torch.float64)
+    angles = 2 * math.pi / 36 * torch.arange(36, dtype=torch.float64, device="cpu")
     cos, sin = angles.cos(), angles.sin()
     return torch.stack([cos, -sin, sin, cos], dim=1).view(-1, 2, 2)
 
@@ -83,9 +84,9 @@ def _circle() -> Tensor:
 def _icosahedron() -> Tensor:
     """Return all products of a turn by 72° about one of its vertices and a half turn about the middle of an edge."""
     x, y, z = (2 * math.pi / 5 * v / math.hypot(1, _GOLDEN) for v in (0, _GOLDEN, 1))
-    fifth = torch.matrix_exp(torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64))
-    half = torch.diag(torch.tensor([-1, -1, 1], dtype=torch.float64))
-    found = torch.eye(3, dtype=torch.float64).unsqueeze(0)
+    fifth = torch.matrix_exp(torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64, device="cpu"))
+    half = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64, device="cpu"))
+    found = torch.eye(3, dtype=torch.float64, device="cpu").unsqueeze(0)
     while len(found) < 60:
         for new in torch.cat([fifth @ found, half @ found]):
             if (found - new).abs().amax((1, 2)).min() > 1e-6:
