@@ -117,6 +117,14 @@ def test_room_counts_what_reading_takes(tmp_path, monkeypatch):
         gate.require_room(tmp_path / "a", 900, held=1100, remedy="do this")
 
 
+def test_pixels_of_one_bit_may_not_take_all_memory(tmp_path, monkeypatch):
+    (tmp_path / "a").write_bytes(bytes(100))
+    monkeypatch.setattr(gate, "available", lambda: 10**12)
+    gate.require_room(tmp_path / "a", 30_000_000, held=10**9)
+    with pytest.raises(InputError, match="announces 125 MB of pixels, far more than it can hold"):
+        gate.require_room(tmp_path / "a", 60_000_000, held=2 * 10**9)
+
+
 @pytest.mark.parametrize(
     "error", [AssertionError, KeyError("x"), RecursionError, struct.error, SyntaxError, OSError(22, "x")]
 )

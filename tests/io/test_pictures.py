@@ -242,7 +242,9 @@ def test_pictures_larger_than_what_is_free_are_refused_before_they_are_read(tmp_
 def test_a_picture_of_many_pixels_is_no_bomb(tmp_path):
     """Pillow refuses some 180 million pixels by itself; the limit here is memory, and the length of the file."""
     limit = PIL.MAX_IMAGE_PIXELS
-    PIL.new("1", (14_000, 13_500)).save(tmp_path / "a.png")
+    picture = PIL.new("1", (14_000, 13_500))
+    picture.paste(PIL.fromarray(np.random.default_rng(0).random((1000, 1000)) < 0.5), (50, 60))
+    picture.save(tmp_path / "a.png")
     assert picture_size(tmp_path / "a.png") == ((13_500, 14_000), 1)
     assert limit == PIL.MAX_IMAGE_PIXELS
 

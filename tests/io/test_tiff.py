@@ -1,6 +1,7 @@
 """TIFF: pages, channels, numbers of any width, and files that make no sense."""
 
 import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -144,6 +145,7 @@ def test_bits_from_the_right(tmp_path):
     [
         {"t256": 100_000, "t257": 100_000},
         {"t256": 2**31, "t257": 2**31},
+        {"t256": 22_000, "t257": 22_000, "t258": 1, "t259": 4},
         {"t256": 2**32 - 1, "t257": 2**32 - 1, "t277": 65_535},
         {"t322": 2**20, "t323": 2**20, "t324": 200, "t325": 64},
         {"t258": 65_535},
@@ -172,6 +174,13 @@ def test_a_page_that_makes_no_sense(tmp_path, capfd, tags):
     assert "\n" not in said
     image_size(tmp_path / "a.tif")
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_strip_that_is_far_longer_than_its_pixels(tmp_path):
+    body = zlib.compress(bytes(200_000_000))
+    (tmp_path / "a.tif").write_bytes(tiny(t259=8, t279=len(body))[:200] + body)
+    with pytest.raises(InputError, match="damaged"):
+        read_image(tmp_path / "a.tif")
 
 
 def test_pages_in_a_ring(tmp_path):

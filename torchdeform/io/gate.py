@@ -18,6 +18,7 @@ CROP = "crop it, or use a machine with more"
 
 LONGEST_TEXT = 16_000_000  # bytes of a text: settings, tables, landmarks, transforms
 _SMALL, _DENSEST = 64_000_000, 1100  # bytes that any file may announce; and per byte of a larger one
+_GROWTH = 16  # times that pixels may grow when they are read: bits become float32
 _MACHINE = {errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 _MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 
@@ -139,9 +140,11 @@ def require_room(
         Nothing that deflate packed becomes more than 1032 times as long, and other packings of pixels stay below.
     """
     stored = path.stat().st_size if stored is None else stored
-    if needed > max(_SMALL, _DENSEST * stored):
-        raise InputError(f"{path} announces {readable(needed)} of pixels, far more than it can hold; it {DAMAGED}")
-    free, held = available(), needed if held is None else held
+    held = needed if held is None else held
+    announced = max(needed, held // _GROWTH)
+    if announced > max(_SMALL, _DENSEST * stored):
+        raise InputError(f"{path} announces {readable(announced)} of pixels, far more than it can hold; it {DAMAGED}")
+    free = available()
     if free is not None and held > free:
         raise InputError(
             f"{path} takes, by its header, {readable(held)} of memory and {readable(free)} are free; {remedy}"

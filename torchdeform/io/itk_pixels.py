@@ -20,7 +20,7 @@ def itk_pixels(path: str) -> NDArray[Any]:
     import SimpleITK as sitk
 
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
-    with native_stderr() as printed:
+    with native_stderr(stdout=True) as printed:
         values = sitk.GetArrayFromImage(sitk.ReadImage(path))
     if any(sign in line for line in printed for sign in _MADE_UP):
         raise ValueError(printed[0])

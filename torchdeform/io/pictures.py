@@ -36,6 +36,7 @@ _BY_ITK = {"PNG": "PNGImageIO", "JPEG": "JPEGImageIO", "MPO": "JPEGImageIO"}
 _KEPT = ("L", "LA", "RGB", "RGBA", "I", "I;16", "I;16L", "I;16B", "F")
 _BECOME = {"1": "L", "PA": "RGBA", "La": "LA", "RGBa": "RGBA"}
 
+_BYTES = 6  # of a number while it is read: as it is stored, up to 16 bits, and float32
 _ORIENTATION = 274  # tag of EXIF and TIFF
 _LIMIT = threading.Lock()
 
@@ -122,9 +123,8 @@ def _require_one(path: Path, picture: Picture.Image) -> None:
     """Raise `InputError` unless the file is one picture that can be in it and fits into memory."""
     if min(picture.size) < 2:
         raise InputError(f"{path} has size {list(picture.size)}; give an image with at least two axes")
-    pixels, channels = math.prod(picture.size), len(picture.getbands())
-    bits = 1 if picture.mode == "1" else 8 * channels
-    require_room(path, pixels * bits // 8, held=pixels * 6 * max(3, channels))
+    pixels, bits = math.prod(picture.size), 1 if picture.mode == "1" else 8 * len(picture.getbands())
+    require_room(path, pixels * bits // 8, held=pixels * _BYTES * Picture.getmodebands(_mode(picture)))
     frames = getattr(picture, "n_frames", 1) if picture.format in _SEVERAL else 1
     if frames > 1:
         raise InputError(f"{path} is a series of {frames} pictures; save one of them and give that")

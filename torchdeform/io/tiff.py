@@ -40,6 +40,8 @@ _DAMAGE_SIGNS = (
 _SLIDES = {"svs", "ndpi", "scn", "bif", "philips", "qpi"}
 _ASIDE = ("label", "macro", "thumbnail", "overview")  # names of images that are not the slide's
 _REDUCED, _MASK = 1, 4  # bits of NewSubfileType
+_PLAIN = 1  # of Compression
+_TABLES = 1 << 16  # bytes that a packing may take beside the pixels
 _KEPT = 4  # bytes of a number of float32, which all become
 _TYPES = ("uint8", "uint16", "float32")  # of ImageJ
 
@@ -178,7 +180,10 @@ def _require_room(series: "Series", path: Path, found: Scale) -> None:
     """Raise `InputError` unless the pixels can be in the file and fit into memory, and the largest piece too."""
     page, count = series[0].keyframe, sum(one.size for one in series)
     size = np.dtype(page.dtype).itemsize
-    require_room(path, math.prod(page.chunks) * size)
+    piece = math.prod(page.chunks) * size
+    require_room(path, piece)
+    if int(page.compression) != _PLAIN and max(page.databytecounts, default=0) > 2 * piece + _TABLES:
+        raise InputError(f"{path} {DAMAGED}")  # unpacked, it would be far longer than its piece of the picture
     packed = count * page.bitspersample // 8
     require_room(path, packed, held=count * (size + _KEPT), remedy=_smaller(series[0], path, size + _KEPT, found))
 

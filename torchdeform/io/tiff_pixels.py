@@ -63,7 +63,8 @@ def unpacked(series: "Series", path: Path) -> NDArray[Any]:
     try:
         if int(page.photometric) == _YCBCR and int(page.compression) not in _UNPACKED_COLOURS:
             raise NotImplementedError("tifffile leaves YCbCr as it is")
-        return np.stack([one.asarray() for one in series]) if len(series) > 1 else series[0].asarray()
+        with native_stderr():
+            return np.stack([one.asarray() for one in series]) if len(series) > 1 else series[0].asarray()
     except (ImportError, NotImplementedError, ValueError) as error:
         if isinstance(error, ValueError) and "imagecodecs" not in str(error):
             raise
