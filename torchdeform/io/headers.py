@@ -102,8 +102,11 @@ def _unpacked_length(path: Path, start: int, packing: str, needed: int) -> int:
                 if not (packed or found) and unpacker.needs_input:
                     break
                 length += found
-        except (zlib.error, OSError):
+        except zlib.error:
             pass
+        except OSError as error:  # the one of bzip2 has no number
+            if error.errno:
+                raise
     return length
 
 
@@ -143,7 +146,7 @@ def sizes(path: Path, text: str, rank: str) -> tuple[int, ...]:
     positive = all(_COUNT.fullmatch(size) and int(size) > 0 for size in found)
     if not positive or not 1 <= len(found) <= _MOST_AXES or (rank and rank != str(len(found))):
         raise InputError(
-            f"{path} has the size '{text[:80]}' in its header, not {rank or '1 to 5'} positive whole numbers; "
+            f"{path} has the size '{text[:80]}' in its header, not {rank[:9] or '1 to 5'} positive whole numbers; "
             "correct the header"
         )
     return tuple(map(int, found))
