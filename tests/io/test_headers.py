@@ -153,12 +153,15 @@ def test_pixels_that_cannot_be_there(tmp_path):
         ("../b.raw", "not beside it"),
         ("/dev/zero", "not beside it"),
         ("pipe.raw", "a device or a pipe"),
+        ("x" * 5000, "does not exist"),
+        ("loop.raw", "cannot be opened"),
     ],
 )
 def test_pixels_elsewhere(tmp_path, name, message):
     (tmp_path / "b.raw").write_bytes(bytes(24))
     (tmp_path / "in").mkdir()
     os.mkfifo(tmp_path / "in" / "pipe.raw")
+    (tmp_path / "in" / "loop.raw").symlink_to("loop.raw")
     header = _header(tmp_path / "in", "raw", bytes(24), files=(tmp_path / "in" / name,))
     with pytest.raises(InputError, match=message):
         header.require_room()

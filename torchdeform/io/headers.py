@@ -2,6 +2,7 @@
 
 import bz2
 import math
+import os
 import re
 import zlib
 from dataclasses import dataclass
@@ -62,9 +63,9 @@ class Header:
     def require_room(self) -> None:
         """Raise `InputError` unless every file of pixels is there and what they announce can be there and fits."""
         for file in self.files:
-            if not (file.exists() or file.is_symlink()):
+            if not os.path.lexists(file):
                 raise InputError(
-                    f"{self.path} keeps its pixels in {file.name}, which does not exist; put it beside the header"
+                    f"{self.path} keeps its pixels in {file.name[:80]}, which does not exist; put it beside the header"
                 )
             require_beside(file, self.path)
         require_room(self.path, self._needed(), stored=self.stored)

@@ -1,6 +1,7 @@
 """NIfTI-1 and NIfTI-2 under any name, packed or not, in one file or two. ITK takes a part of them only."""
 
 import math
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -192,7 +193,7 @@ def _pixels_beside(path: Path) -> Path:
     name = path.name.removesuffix(suffix(path)) if suffix(path) in (".hdr", ".hdr.gz") else path.name
     found = [path.with_name(name + ending) for ending in (".img", ".img.gz", ".IMG")]
     for data in found:
-        if data.exists() or data.is_symlink():
+        if os.path.lexists(data):
             require_beside(data, path)
             return data
     raise InputError(
