@@ -110,8 +110,11 @@ def _parts(text: str, path: Path) -> list[Path]:
     others = [e for e in root.iterfind(".//{*}TiffData/{*}UUID") if e.text is None or e.text != root.get("UUID")]
     names = dict.fromkeys(e.get("FileName", path.name) for e in others)
     parts = [path.parent / name for name in names if name.lower() != path.name.lower()]
-    for part in parts:
-        require_beside(part, path)
+    try:
+        for part in parts:
+            require_beside(part, path)
+    except InputError as error:
+        raise InputError(f"{path} is an image in several files: {error}") from None
     return parts
 
 
@@ -147,9 +150,11 @@ def _log_messages() -> Iterator[list[str]]:
 
 def _shown_series(file: "TiffFile") -> "Series":
     """Return the series of pages that show what the file is of: no smaller copies, masks, labels or macros."""
-    full = [one for one in file.series if not int(one.keyframe.subfiletype) & (_REDUCED | _MASK)]
-    full = [one for one in full if not any(word in one.name.lower() for word in _ASIDE)] or file.series
-    return [max(full, key=lambda one: one.size)] if file.flags & _SLIDES else full
+    full = [one for one in file.series if not int(one.keyframe.subfiletype) & (_REDUCED | _MASK)] or file.series
+    largest = max(full, key=lambda one: one.size)
+    if file.flags & _SLIDES:
+        return [largest]
+    return [one for one in full if one.size == largest.size or not any(word in one.name.lower() for word in _ASIDE)]
 
 
 def _require_one(series: "Series", path: Path) -> tuple[str, tuple[int, ...]]:
@@ -160,7 +165,7 @@ def _require_one(series: "Series", path: Path) -> tuple[str, tuple[int, ...]]:
         sizes = ", ".join("×".join(map(str, s.shape)) for s in series[:3])
         raise InputError(f"{path} has pages of different sizes ({sizes}); save the page that you want and give that")
     several = {axis: n for axis, n in zip(first.axes, first.shape, strict=True) if n > 1}
-    if others and not set(several) & set(_DEPTH):  # pages written one by one
+    if others and first.kind != "ome" and not set(several) & set(_DEPTH):  # pages written one by one
         return _DEPTH[0] + first.axes, (1 + len(others), *first.shape)
     other = [n for axis, n in several.items() if axis not in "YX" + _DEPTH + _CHANNELS]
     if other or others:
