@@ -153,8 +153,12 @@ def require_room(
 
 def require_beside(data: Path, header: Path) -> None:
     """Raise `InputError` unless ``data``, that a header names, is a regular file beside or below the header."""
-    home = header.parent.resolve()
-    if not data.resolve().is_relative_to(home):
+    require_name(data, "file of pixels")
+    try:
+        beside = data.resolve().is_relative_to(header.parent.resolve())
+    except (OSError, RuntimeError) as error:  # too long, or links that lead to each other
+        raise InputError(f"{header} keeps its pixels in {data.name[:80]}, which cannot be opened; rename it") from error
+    if not beside:
         raise InputError(f"{header} keeps its pixels in {data}, which is not beside it; put both into one folder")
     require_file(data, "file of pixels")
 

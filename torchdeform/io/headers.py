@@ -2,6 +2,7 @@
 
 import bz2
 import math
+import os
 import re
 import zlib
 from dataclasses import dataclass
@@ -62,9 +63,9 @@ class Header:
     def require_room(self) -> None:
         """Raise `InputError` unless every file of pixels is there and what they announce can be there and fits."""
         for file in self.files:
-            if not (file.exists() or file.is_symlink()):
+            if not os.path.lexists(file):
                 raise InputError(
-                    f"{self.path} keeps its pixels in {file.name}, which does not exist; put it beside the header"
+                    f"{self.path} keeps its pixels in {file.name[:80]}, which does not exist; put it beside the header"
                 )
             require_beside(file, self.path)
         require_room(self.path, self._needed(), stored=self.stored)
@@ -102,8 +103,11 @@ def _unpacked_length(path: Path, start: int, packing: str, needed: int) -> int:
                 if not (packed or found) and unpacker.needs_input:
                     break
                 length += found
-        except (zlib.error, OSError):
+        except zlib.error:
             pass
+        except OSError as error:  # the one of bzip2 has no number
+            if error.errno:
+                raise
     return length
 
 
@@ -143,7 +147,7 @@ def sizes(path: Path, text: str, rank: str) -> tuple[int, ...]:
     positive = all(_COUNT.fullmatch(size) and int(size) > 0 for size in found)
     if not positive or not 1 <= len(found) <= _MOST_AXES or (rank and rank != str(len(found))):
         raise InputError(
-            f"{path} has the size '{text[:80]}' in its header, not {rank or '1 to 5'} positive whole numbers; "
+            f"{path} has the size '{text[:80]}' in its header, not {rank[:9] or '1 to 5'} positive whole numbers; "
             "correct the header"
         )
     return tuple(map(int, found))

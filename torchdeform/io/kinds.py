@@ -60,7 +60,7 @@ def _unpacked_head(path: Path) -> bytes:
         with gzip.open(path) as file:
             while len(head) < _HEAD and (part := file.read1(_HEAD - len(head))):
                 head += part
-    except (OSError, EOFError, zlib.error):
+    except (gzip.BadGzipFile, EOFError, zlib.error):
         pass
     return head
 

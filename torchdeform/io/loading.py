@@ -109,6 +109,8 @@ def _execute(reader: "sitk.ImageFileReader", vectors: bool) -> "sitk.Image | Run
     try:
         reader.ReadImageInformation()
         path, size = Path(reader.GetFileName()), reader.GetSize()
+        if not all(size):
+            raise InputError(f"{path} has the size {size} in its header; correct the header")
         if not reader.GetImageIO():  # else its header was checked before
             require_room(path, math.prod(size) * reader.GetNumberOfComponents())
         if vectors and reader.GetNumberOfComponents() == 1 and is_stack(size):

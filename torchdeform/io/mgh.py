@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from torchdeform.errors import InputError
-from torchdeform.io.gate import DAMAGED, require_room
+from torchdeform.io.gate import DAMAGED, reading, require_room
 from torchdeform.io.nifti import place
 from torchdeform.io.packed import opened
 from torchdeform.io.volume import NOT_FINITE, Volume, require_one
@@ -39,13 +39,11 @@ def read_mgh(path: Path) -> Volume:
     from nibabel.fileholders import FileHolder
     from nibabel.freesurfer.mghformat import MGHImage
 
-    try:
-        with opened(path) as file:
-            image = MGHImage.from_file_map({"image": FileHolder(fileobj=file)}, mmap=False)
-            values = np.asarray(image.dataobj)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"{path} {DAMAGED}") from error
-    if values.dtype.kind == "f" and not np.isfinite(values).all():
-        raise InputError(f"{path} {NOT_FINITE}")
-    values = values.reshape(values.shape[:3]).T[..., None]
-    return place(values.astype(values.dtype.newbyteorder("="), copy=False), np.asarray(image.affine)[:3], path)
+    with reading(path), opened(path) as file, np.errstate(all="ignore"):  # what is not finite is refused
+        image = MGHImage.from_file_map({"image": FileHolder(fileobj=file)}, mmap=False)
+        values = np.asarray(image.dataobj)
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise InputError(f"{path} {NOT_FINITE}")
+        values = values.reshape(values.shape[:3]).T[..., None]
+        native = values.astype(values.dtype.newbyteorder("="), copy=False)
+        return place(native, np.asarray(image.affine)[:3], path)

@@ -1,6 +1,7 @@
 """NIfTI-1 and NIfTI-2 under any name, packed or not, in one file or two. ITK takes a part of them only."""
 
 import math
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -136,11 +137,17 @@ def read_nifti(path: Path, *, vectors: bool = False) -> Volume:
     header = replace(_read_header(path), vectors=vectors)
     require_one(path, header.space)
     with opened(header.data, path) as file:
-        values = _scaled(_pixels(file, header), header)
+        values = _pixels(file, header)
+    with np.errstate(all="ignore"):  # what is not finite is refused
+        return _volume(values, header)
+
+
+def _volume(stored: NDArray[np.generic], header: _Header) -> Volume:
+    """Return scaled pixels in their place."""
+    values, (rows, remarks) = _scaled(stored, header), _rows(header)
     if values.dtype.kind == "f" and not np.isfinite(values).all():
-        raise InputError(f"{path} {NOT_FINITE}")
-    rows, remarks = _rows(header)
-    volume = place(values, rows, path)
+        raise InputError(f"{header.path} {NOT_FINITE}")
+    volume = place(values, rows, header.path)
     volume = replace(volume, remarks=remarks, intent=int(header.fields["intent"]), stacked=header.stacked)
     volume = _with_pixdim(volume, header)
     return volume.in_units_of(*_UNITS.get(int(header.fields["units"]) & 7, (1.0, "mm")))
@@ -186,7 +193,7 @@ def _pixels_beside(path: Path) -> Path:
     name = path.name.removesuffix(suffix(path)) if suffix(path) in (".hdr", ".hdr.gz") else path.name
     found = [path.with_name(name + ending) for ending in (".img", ".img.gz", ".IMG")]
     for data in found:
-        if data.exists() or data.is_symlink():
+        if os.path.lexists(data):
             require_beside(data, path)
             return data
     raise InputError(
@@ -218,9 +225,8 @@ def _scaled(values: NDArray[np.generic], header: _Header) -> NDArray[np.generic]
         return values
     if not math.isfinite(inter):
         raise InputError(f"{header.path} has the intercept {inter} in its header; correct the header")
-    with np.errstate(all="ignore"):  # what is not finite is refused later
-        found = slope * values.astype(np.float64) + inter
-        return found if values.dtype.itemsize > 4 else found.astype(np.float32)
+    found = slope * values.astype(np.float64) + inter
+    return found if values.dtype.itemsize > 4 else found.astype(np.float32)
 
 
 def _rows(header: _Header) -> tuple[NDArray[np.float64], tuple[str, ...]]:
@@ -249,8 +255,7 @@ def _rows(header: _Header) -> tuple[NDArray[np.float64], tuple[str, ...]]:
 def _spans(rows: NDArray[np.float64], size: tuple[int, ...]) -> bool:
     """Return whether an affine gives every axis of several samples a direction of its own."""
     columns = rows[:, [k for k, n in enumerate(size[:3]) if n > 1]]
-    with np.errstate(all="ignore"):
-        units = columns / np.linalg.norm(columns, axis=0)
+    units = columns / np.linalg.norm(columns, axis=0)
     finite = bool(np.isfinite(rows).all() and np.isfinite(units).all())
     return finite and np.linalg.matrix_rank(units, 1e-3) == units.shape[1]
 
@@ -305,9 +310,8 @@ def place(values: NDArray[np.generic], rows: NDArray[np.float64], path: Path) ->
         if size[axis] == 1 and not columns[:, axis].any():
             columns[:, axis] = np.cross(columns[:, axis - 2], columns[:, axis - 1])
             columns[:, axis] /= max(np.linalg.norm(columns[:, axis]), np.finfo(float).tiny)
-    with np.errstate(all="ignore"):
-        lengths = np.linalg.norm(columns, axis=0)
-        volume = abs(np.linalg.det(columns / lengths))
+    lengths = np.linalg.norm(columns, axis=0)
+    volume = abs(np.linalg.det(columns / lengths))
     if not (np.isfinite(lengths).all() and lengths.all() and volume > _SINGULAR):
         raise InputError(f"{path} has an affine that is singular; correct its header")
     values = values.reshape(*size[::-1], -1)
