@@ -1,5 +1,7 @@
 """The page of a cohort: every pair once, the worst first, every text escaped, every link to something."""
 
+import base64
+import hashlib
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -86,6 +88,17 @@ def test_every_text_is_escaped(page):
     found = read(page)
     assert found.tags.count("script") == 1  # the page's own
     assert sum(NASTY in text for text in found.texts) == 3  # why one failed, and two headlines that are not good
+
+
+def test_no_script_but_the_page_s_own_can_run(page):
+    text = page.read_text(encoding="utf-8")
+    script = text.partition("<script>")[2].partition("</script>")[0]
+    known = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = text.partition('Content-Security-Policy" content="')[2].partition('"')[0]
+    rules = dict(rule.strip().partition(" ")[::2] for rule in policy.split(";"))
+    assert rules["script-src"] == f"'sha256-{known}'"
+    assert [rules[name] for name in ("default-src", "base-uri", "form-action")] == ["'none'"] * 3
+    assert rules["img-src"] == "'self' file:"
 
 
 def test_links_lead_to_files(page):

@@ -1,18 +1,21 @@
 """Memory: the estimate against measured processes, what is free, sizes in words, grids that fit."""
 
 import math
+import re
 import sys
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from memory import QUICK, estimated, measure  # type: ignore[attr-defined]
 from nested_settings import settings_of
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.memory import parse_size
+from torchdeform.core.memory import at_least, parse_size
 from torchdeform.core.resampling import MIN_NODES
 from torchdeform.errors import InputError
 from torchdeform.metrics.similarity import MEASURES
-from torchdeform.pipeline.memory import fitting_grid, footprint
+from torchdeform.pipeline.memory import advice, fitting_grid, footprint
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="measured by what Linux tells of a process")
 
@@ -114,3 +117,35 @@ def test_what_reading_and_writing_take_is_the_least():
         fitting(Grid((256, 256, 256)), parse_size("1GB"))
     least = str(said.value).partition("at least ")[2].partition(",")[0]
     assert max(fitting(Grid((256, 256, 256)), round(1.01 * parse_size(least)), similarity="mind").shape) < 256
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    shape=st.lists(st.integers(8, 700), min_size=2, max_size=3),
+    channels=st.integers(1, 4),
+    symmetric=st.booleans(),
+    start=st.sampled_from(["identity", "discrete"]),
+    similarity=st.sampled_from(sorted(MEASURES)),
+    solver=st.sampled_from(["auto", "assembled"]),
+    limit=st.integers(1, 2 * 10**9),
+)
+def test_the_limit_that_is_advised_is_accepted(shape, channels, symmetric, start, similarity, solver, limit):
+    """Whatever was refused: the size in the sentence, given next, is not refused again."""
+    grid = Grid(tuple(shape))
+    how = settings_of(symmetric=symmetric, start=start, similarity=similarity, solver=solver)
+    try:
+        fitting_grid(grid, limit, channels, how)
+    except InputError as error:
+        advised = parse_size(str(error).partition("at least ")[2].partition(",")[0])
+        fitting_grid(grid, advised, channels, how)
+    found = re.search(r"--memory (\S+) to register", advice(grid, limit, channels, how))
+    if found:
+        fitting_grid(grid, parse_size(found[1]), channels, how)
+    else:
+        with pytest.raises(InputError, match="too little"):
+            fitting_grid(grid, limit, channels, how)
+
+
+@given(st.integers(1, 9 * 10**14))
+def test_a_size_that_is_rounded_up_is_not_less_and_hardly_more(size):
+    assert size <= parse_size(at_least(size)) <= max(1.02 * size, size + 1)

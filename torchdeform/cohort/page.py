@@ -13,6 +13,7 @@ from torchdeform.cohort.strips import WIDTH, strip_of
 from torchdeform.cohort.task import DONE, FAILED
 from torchdeform.io.files import atomic_folder
 from torchdeform.pipeline.register import OVERVIEW, REPORT, THUMBNAIL
+from torchdeform.report.page import script_hash
 
 WAITING = "waiting"
 
@@ -103,7 +104,9 @@ def write_page(path: Path, rows: Sequence[Row], failures: Mapping[str, Row]) -> 
         Its size is about half a kilobyte a pair; pictures are loaded when they come into view.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
 
+    script = Markup((_TEMPLATES / "index.js").read_text(encoding="utf-8"))
     loader = FileSystemLoader(_TEMPLATES)
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -123,6 +126,8 @@ def write_page(path: Path, rows: Sequence[Row], failures: Mapping[str, Row]) -> 
             for row in sorted(rows, key=lambda row: order.index(badge_of(row)))
         ),
         version=__version__,
+        script=script,
+        script_hash=script_hash(script),
     )
     with atomic_folder(path.parent) as folder, (folder / path.name).open("w", encoding="utf-8") as file:
         file.writelines(text)

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Self
 
-from torchdeform.cohort.executors.local import Engine
+from torchdeform.cohort.executors.local import Answer, Engine
 from torchdeform.cohort.journal import JOURNAL, Journal, Record, append, open_lines
 from torchdeform.cohort.plan import SUBMISSION, Failure, Job
 from torchdeform.cohort.settings import EngineSettings
@@ -236,7 +236,7 @@ class _State:
 
 def _register_all(jobs: Sequence[Job], engine: Engine, state: _State) -> None:
     """Keep the engine busy until every job has a report."""
-    waiting, running = iter(jobs), dict[Future[PairReport], tuple[Job, str]]()
+    waiting, running = iter(jobs), dict[Future[Answer], tuple[Job, str]]()
     try:
         while _fill(running, waiting, engine, state):
             finished = wait(running, return_when=FIRST_COMPLETED).done
@@ -247,11 +247,12 @@ def _register_all(jobs: Sequence[Job], engine: Engine, state: _State) -> None:
     finally:  # Ctrl-C may come between the end of a pair and its line in the journal
         for future, (job, key) in running.items():
             if future.done() and not future.cancelled() and future.exception() is None:
-                state.record(job, key, future.result())
+                with suppress(Exception):  # an error about the process says nothing about the pair
+                    state.record(job, key, _answer(future))
 
 
 def _fill(
-    running: dict[Future[PairReport], tuple[Job, str]], waiting: Iterator[Job], engine: Engine, state: _State
+    running: dict[Future[Answer], tuple[Job, str]], waiting: Iterator[Job], engine: Engine, state: _State
 ) -> bool:
     """Submit jobs until the engine has enough; return whether any are running."""
     while len(running) < engine.window and (job := next(waiting, None)) is not None:
@@ -260,10 +261,18 @@ def _fill(
     return bool(running)
 
 
-def _report(future: Future[PairReport]) -> PairReport:
+def _answer(future: Future[Answer]) -> PairReport:
+    """Return the report of a task, or raise its error."""
+    answer = future.result()
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
+
+
+def _report(future: Future[Answer]) -> PairReport:
     """Return the report of a task; a lost process gives a report, too."""
     try:
-        return future.result()
+        return _answer(future)
     except (EngineError, MachineError):
         raise
     except CancelledError as error:

@@ -1,5 +1,6 @@
 """Memory of this machine: how much is free, how much was used, and sizes as people write them."""
 
+import math
 import re
 import sys
 from pathlib import Path
@@ -98,3 +99,9 @@ def readable(size: int, *, spaced: bool = True) -> str:
     """Return a number of bytes with a unit, as ``1.9 GB``; without the space `parse_size` takes it as a setting."""
     exponent = next((e for e in range(4) if size / 1000**e < 999.5), 4)  # 999.5 has three digits no more
     return f"{size / 1000**exponent:.3g}{' ' if spaced else ''}{('B', 'kB', 'MB', 'GB', 'TB')[exponent]}"
+
+
+def at_least(size: int) -> str:
+    """Return a number of bytes as `parse_size` takes it, with three digits and not less than ``size``."""
+    text = readable(size, spaced=False)
+    return text if parse_size(text) >= size else readable(math.ceil(1.005 * size), spaced=False)

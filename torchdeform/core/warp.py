@@ -149,6 +149,8 @@ def _sample(image: Tensor, normalised: Tensor, mode: str) -> Tensor:
     items, dim, *shape = normalised.shape
     if 1 not in (items, image.shape[0]) and items != image.shape[0]:
         raise InputError(f"sample: image has {image.shape[0]} batch items but the points have {items}")
+    if normalised.numel() == 0:  # no points, which grid_sample refuses
+        return image.new_zeros(max(items, image.shape[0]), image.shape[1], *shape)
     parts = _parts(image, normalised)
     batch = max(items, image.shape[0]) * parts
     where = normalised.to(image.dtype).reshape(items, dim, parts, -1).permute(0, 2, 3, 1).flatten(0, 1)

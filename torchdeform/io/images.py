@@ -87,7 +87,7 @@ def _read(file: Path, *, exact: bool = False) -> Image:
     if may_be_dicom(file):
         return dicom.read_file(file)
     if is_tiff(file):
-        return read_tiff(file)
+        return read_tiff(file, exact=exact)
     if is_picture(file):
         return read_picture(file)
     if kind_of(file) == GZIP:
@@ -215,7 +215,7 @@ def _size(path: Path) -> tuple[tuple[int, ...], int] | None:
 
 
 def read_labels(path: str | os.PathLike[str]) -> Image:
-    """Read a label image: like `read_image`, but volumes in float64 if float32 would merge labels above 2²⁴.
+    """Read a label image: like `read_image`, but in float64 if float32 would merge labels above 2²⁴.
 
     Args:
         path: the file, any format that `read_image` reads.

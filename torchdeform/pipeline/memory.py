@@ -3,7 +3,7 @@
 import math
 
 from torchdeform.core.grid import Grid
-from torchdeform.core.memory import readable
+from torchdeform.core.memory import at_least, readable
 from torchdeform.core.resampling import MIN_NODES, with_spacing
 from torchdeform.errors import InputError
 from torchdeform.fem.solver import LARGEST_MATRIX
@@ -62,6 +62,19 @@ def _affine(grid: Grid, channels: int, rate: tuple[float, float]) -> int:
     return round(_PROCESS_BYTES + (node + channels * channel) * math.prod(grid.shape))
 
 
+def least_for(grid: Grid, channels: int, settings: RegistrationSettings) -> int:
+    """Return the bytes that a registration takes at least, however coarse its finest level is."""
+    return min(_affine(grid, channels, _FILES[grid.dim]), footprint(grid, channels, settings))
+
+
+def advice(grid: Grid, free: int, channels: int, settings: RegistrationSettings) -> str:
+    """Return what to do about a registration that takes more than the ``free`` bytes."""
+    least = least_for(grid, channels, settings)
+    if free < least:
+        return f"no --memory helps, as any grid takes {readable(least)}; resample it, or use a machine with more"
+    return f"use --memory {at_least(free)} to register it on a coarser grid"
+
+
 def fitting_grid(grid: Grid, limit: int, channels: int, settings: RegistrationSettings) -> Grid:
     """Return the finest grid of the same box on which a registration takes at most ``limit`` bytes.
 
@@ -77,11 +90,11 @@ def fitting_grid(grid: Grid, limit: int, channels: int, settings: RegistrationSe
     Notes:
         Voxels become larger until it fits, the small ones of thick slices first, as in `pyramid_grids`.
     """
-    least = min(_affine(grid, channels, _FILES[grid.dim]), footprint(grid, channels, settings))
+    least = least_for(grid, channels, settings)
     if limit < least:
         raise InputError(
             f"--memory {readable(limit, spaced=False)} is too little for a fixed image of "
-            f"{grid.size_text}: give at least {readable(least, spaced=False)}, or resample it"
+            f"{grid.size_text}: give at least {at_least(least)}, or resample it"
         )
     size, coarser = min(grid.spacing), grid
     while footprint(coarser, channels, settings) > limit and max(coarser.shape) > MIN_NODES:

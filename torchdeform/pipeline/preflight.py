@@ -20,7 +20,7 @@ from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
 from torchdeform.io.files import stem
 from torchdeform.metrics.similarity import needs_common_scale
-from torchdeform.pipeline.memory import footprint
+from torchdeform.pipeline.memory import advice, footprint
 from torchdeform.registration.settings import RegistrationSettings
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
@@ -103,8 +103,8 @@ def preflight(
         *(Finding(WARNING, text) for image in given for text in image.remarks),
         *_check_values(fixed),
         *_check_values(moving),
-        *_check_nodes(fixed, ERROR),
-        *_check_nodes(moving, WARNING),
+        *_check_nodes(fixed),
+        *_check_nodes(moving),
         *_check_spacing(fixed, moving),
         *_check_spacing(moving, fixed),
     ]
@@ -164,10 +164,12 @@ def _check_values(image: Image) -> Iterator[Finding]:
         yield Finding(WARNING, f"{image.name} is 0 in {zeros:.1%} of its pixels; crop it to what is to be aligned")
 
 
-def _check_nodes(image: Image, severity: str) -> Iterator[Finding]:
+def _check_nodes(image: Image) -> Iterator[Finding]:
     if min(image.grid.shape) < MIN_NODES:
-        text = f"{image.name} has the size {image.grid.size_text}; every axis needs at least {MIN_NODES} voxels"
-        yield Finding(severity, f"{text}: resample it")
+        text = (
+            f"{image.name} has the size {image.grid.size_text}; nothing is moved along axes of fewer than {MIN_NODES}"
+        )
+        yield Finding(NOTE, f"{text} voxels")
 
 
 def _check_spacing(image: Image, partner: Image) -> Iterator[Finding]:
@@ -267,12 +269,13 @@ def _check_orientation(fixed: Image, moving: Image) -> Iterator[Finding]:
 
 def _check_memory(fixed: Image, settings: RegistrationSettings) -> Iterator[Finding]:
     room = available(fixed.data.device)
-    need = footprint(fixed.grid, fixed.data.shape[1], settings)
+    channels = fixed.data.shape[1]
+    need = footprint(fixed.grid, channels, settings)
     if room is None or need < 0.8 * room:
         return
     text = (
         f"registration at {fixed.grid.size_text} takes about {readable(need)} of memory and {readable(room)} are free; "
-        f"give --memory {readable(room, spaced=False)} to stop at a coarser level, or crop {fixed.name}"
+        f"{advice(fixed.grid, room, channels, settings)}, or crop {fixed.name}"
     )
     yield Finding(ERROR if need > 1.25 * room else WARNING, text)
 

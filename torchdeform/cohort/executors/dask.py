@@ -1,6 +1,7 @@
 """The engine of a Dask cluster: one pair at a time on each thread of its workers."""
 
 import itertools
+import logging
 import signal
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -50,6 +51,7 @@ def open_dask(settings: EngineSettings, jobs: Sequence[Job], logs: Path) -> Iter
         import distributed
     except ImportError as error:
         raise InputError("engine kind dask needs Dask: pip install 'torchdeform[dask]'") from error
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong, `run` says in a sentence
     needs = dict(zip((job.name for job in jobs), measure(jobs), strict=True))
     with ExitStack() as stack:
         cluster = settings.cluster
@@ -68,15 +70,21 @@ def _threads(settings: EngineSettings) -> int:
     return settings.cluster.cores // settings.cluster.workers if settings.cluster else 0
 
 
-def isolated(task: Task, timeout: float, threads: int) -> PairReport:
+def isolated(task: Task, timeout: float, threads: int) -> PairReport | Exception:
     """Run a task in the process of this thread of a Dask worker, so that it can be killed alone.
 
     Args:
         task: the pair.
         timeout: limit in seconds.
         threads: of the process; 0 divides the cores of the machine among the threads of the Dask worker.
+
+    Returns:
+        The report, or the error about the process; of an error that is raised Dask prints the traceback.
     """
-    return _own_worker(threads or _share(), task.job.device != "cpu").call(perform, task, timeout=timeout)
+    try:
+        return _own_worker(threads or _share(), task.job.device != "cpu").call(perform, task, timeout=timeout)
+    except Exception as error:  # noqa: BLE001 - the run raises it
+        return error
 
 
 def _own_worker(threads: int, gpu: bool) -> Worker:
@@ -152,6 +160,7 @@ def start(cluster: ClusterSettings, logs: Path) -> Any:
                 n_workers=cluster.jobs,
                 threads_per_worker=cluster.workers,
                 memory_limit=0,
+                silence_logs=logging.CRITICAL,
                 resources=declared_of(cluster),
                 dashboard_address="127.0.0.1:0",  # any free port, visible on this machine only
             )

@@ -17,6 +17,8 @@ from torchdeform.cohort.task import PairReport, Task, perform
 from torchdeform.core.memory import available
 from torchdeform.core.worker import Worker
 
+Answer = PairReport | Exception
+
 
 @dataclass(frozen=True)
 class Engine:
@@ -25,16 +27,16 @@ class Engine:
     Attributes:
         executor: the executor for a job, by what the job needs.
         window: number of jobs that are submitted at a time.
-        function: what the executor calls with a task.
+        function: what the executor calls with a task; it may return an error instead of raising it.
         arguments: further arguments of that function.
     """
 
     executor: Callable[[Job], Executor]
     window: int
-    function: Callable[..., PairReport] = perform
+    function: Callable[..., Answer] = perform
     arguments: tuple[object, ...] = ()
 
-    def submit(self, task: Task) -> Future[PairReport]:
+    def submit(self, task: Task) -> Future[Answer]:
         """Submit a pair."""
         return self.executor(task.job).submit(self.function, task, *self.arguments)
 

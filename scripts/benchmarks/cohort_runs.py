@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import subprocess
 import sys
 import time
@@ -18,7 +19,9 @@ settings: {{align: none, similarity: ssd, metric: {{length_scale: 8}}, optimiser
 device: cpu
 engine: {engine}
 """
+_MARK = "TORCHDEFORM_COHORT_RUN"  # in the environment of every process of a run
 ENGINES = {
+    "one": "{workers: 1, threads: 1}",
     "local": "{workers: 2, threads: 1}",
     "dask": "{kind: dask, threads: 1, cluster: {kind: local, jobs: 2, memory: 2GB}}",
 }
@@ -40,7 +43,8 @@ def start(cohort: Path, *options: str, **how: object) -> "subprocess.Popen[str]"
     """Start ``torchdeform batch`` in a process of its own."""
     command = [sys.executable, "-m", "torchdeform.cli.main", "batch", str(cohort), *options]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return subprocess.Popen(command, text=True, **(pipes | how))  # type: ignore[call-overload]
+    environment = os.environ | {_MARK: str(cohort)}
+    return subprocess.Popen(command, text=True, env=environment, **(pipes | how))  # type: ignore[call-overload]
 
 
 def finish(cohort: Path, *options: str) -> tuple[int, str, str]:
@@ -77,7 +81,8 @@ def summary(cohort: Path) -> dict[str, str]:
     """Return the status of every pair in the summary, where each must be once."""
     with (cohort.parent / "out" / "summary.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len({row["name"] for row in rows}) == len(rows)
+    if len({row["name"] for row in rows}) != len(rows):
+        raise ValueError(f"a pair is twice in the summary of {cohort}")
     return {row["name"]: row["status"] for row in rows}
 
 
@@ -105,4 +110,23 @@ def faults(cohort: Path, names: str, right: bytes | None = None) -> list[str]:
         found.append("summary")
     if list(cohort.parent.rglob(".torchdeform-*")):
         found.append("left behind")
+    return found
+
+
+def living(cohort: Path, seconds: float) -> list[int]:
+    """Return the processes of runs of a cohort that are still there after some seconds; Linux only."""
+    end = time.monotonic() + seconds
+    while (found := _started(cohort)) and time.monotonic() < end:
+        time.sleep(0.1)
+    return found
+
+
+def _started(cohort: Path) -> list[int]:
+    mark, found = f"{_MARK}={cohort}".encode(), []
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            if mark in (place / "environ").read_bytes().split(b"\0"):
+                found.append(int(place.name))
+        except OSError:
+            continue
     return found
