@@ -79,6 +79,16 @@ def test_outside_its_grid_a_displacement_does_nothing(spaces):
     torch.testing.assert_close(moved, far, atol=1e-9, rtol=0)
 
 
+def test_a_displacement_goes_on_around_its_nodes_as_far_as_its_margin():
+    place = Image(torch.zeros(1, 1, 4, 5), Grid((4, 5), (2.0, 3.0)))
+    field = replace(place, data=torch.ones(1, 2, 4, 5, dtype=torch.float64))
+    points = torch.tensor([[0.0, 0.0], [12.0, 6.0], [-0.1, 0.0], [12.1, 6.0], [-1.4, 3.0], [-1.6, 3.0]]).double()
+    for margin, moved in ((0.5, [1, 1, 1, 1, 1, 0]), (1e-6, [1, 1, 0, 0, 0, 0])):
+        stage = Displacement(field, margin=margin).to("cpu")
+        found = Transform((stage,)).points(points) - points
+        assert found.round().tolist() == [[m, m] for m in moved]
+
+
 def test_the_image_is_pulled_back(spaces, chain):
     """With the displacement alone this is `resample`; with the chain it is moving(φ(x)), which is known by formula."""
     fixed, moving = spaces

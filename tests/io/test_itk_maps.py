@@ -55,6 +55,7 @@ def test_the_order_of_a_spline(tmp_path, order):
         ("Transform: DisplacementFieldTransform_double_2_2\nParameters: 0 0\nFixedParameters: 90000 90000 0 0 1 1 "
          "1 0 0 1\n", "damaged"),
         ("Transform: BSplineTransform_double_3_3\nParameters: 0\nFixedParameters: nan\n", "damaged"),
+        ("Transform: BSplineTransform_double_3_3\nParameters: 0\nFixedParameters: 4 x 4\n", "damaged"),
         ("Transform: ThinPlateSplineKernelTransform_double_3_3\nParameters: 0\nFixedParameters: 0\n",
          "holds a ThinPlateSplineKernelTransform_double_3_3, which ITK cannot read"),
         ("Transform: AffineTransform_double_4_4\nParameters: 1\nFixedParameters: 0\n", "cannot be read|of 4D"),

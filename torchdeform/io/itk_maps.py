@@ -9,7 +9,7 @@ import numpy as np
 
 from torchdeform.errors import InputError
 from torchdeform.io.files import native_stderr
-from torchdeform.io.gate import DAMAGED
+from torchdeform.io.gate import DAMAGED, reading
 from torchdeform.io.isolated import isolated
 from torchdeform.io.loading import volume_of
 from torchdeform.io.maps import Linear, Spline, to_field
@@ -43,7 +43,8 @@ def _read(path: Path, known: str) -> list[Linear | Spline | Volume]:
     import SimpleITK as sitk
 
     if path.suffix.lower() in _TEXT:
-        _require_grids(path)
+        with reading(path):
+            _require_grids(path)
     with native_stderr() as printed:
         try:
             transform = sitk.ReadTransform(str(path))

@@ -20,7 +20,7 @@ from torchdeform.io.gate import require_file
 from torchdeform.io.loading import reason
 from torchdeform.io.maps import Linear, Spline
 from torchdeform.io.volume import Volume
-from torchdeform.io.warps import read_vectors
+from torchdeform.io.volumes import read_volume
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
@@ -33,6 +33,10 @@ AFFINES = (".tfm", ".txt", ".mat")
 FIELDS = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd")
 
 
+# NIfTI's intents of warps that FSL writes: fields and coefficients.
+_FSL_INTENTS = (2006, 2007, 2008, 2009)
+# Vectors that miss the places of their voxels by a smaller share of the places' spread are positions.
+_POSITIONS = 0.2
 # Voxels around the domain of a spline that still belong to it.
 _NONE = 1e-6
 
@@ -70,7 +74,25 @@ def read_displacement(path: _Path) -> Image:
     """
     file = Path(path)
     require_file(file, "displacement field")
-    return _to_field(itk.volume_image(read_vectors(file), str(path)))
+    volume = read_volume(file, vectors=True)
+    if volume.intent in _FSL_INTENTS:
+        raise InputError(
+            f"{path} is a warp of FSL; convert it with `wb_command -convert-warpfield -from-fnirt {file.name} "
+            "moving.nii.gz -to-itk field.nii.gz`"
+        )
+    if volume.stacked:
+        _require_displacements(volume, file)
+    return _to_field(itk.volume_image(volume, str(path)))
+
+
+def _require_displacements(volume: Volume, path: Path) -> None:
+    """Raise `InputError` if vectors are rather the positions that nodes go to, in LPS or RAS, than displacements."""
+    index = np.stack(np.meshgrid(*map(np.arange, volume.size), indexing="ij"), axis=-1) * volume.spacing
+    places = index @ volume.direction.T + volume.origin
+    values = volume.values.swapaxes(0, -2)[..., :2].astype(np.float64)
+    for positions in (places[..., :2], -places[..., :2]):
+        if np.std(values - positions) < _POSITIONS * np.std(positions):
+            raise InputError(f"{path} holds positions, not displacements; subtract from each voxel its place in LPS mm")
 
 
 def voxel_displacement(u: Tensor, fixed: Image, moving: Image) -> Tensor:
