@@ -22,7 +22,7 @@ from torchdeform.errors import InputError
         ({"workers": 0}, "greater than or equal to 1"),
         ({"timeout": 0}, "greater than 0"),
         ({"timeout": float("inf")}, "less than or equal to 1000000000"),
-        ({"timeout": float("nan")}, "greater than 0"),
+        ({"timeout": float("nan")}, "less than or equal"),
         ({"workers": 2**62}, "less than or equal to 1000000"),
     ],
 )
