@@ -259,7 +259,7 @@ def _channels():
         (None, ["fixed.png", "moving.png", "--set", "windw=5"], "did you mean 'similarity.window'?"),
         (None, ["fixed.png", "moving.png", "--set", "window"], "--set needs key=value"),
         (None, ["fixed.png", "moving.png", "--preset", "fst"], "did you mean 'fast'?"),
-        (None, ["fixed.png", "moving.png", "--config", "no.yaml"], "no.yaml cannot be read"),
+        (None, ["fixed.png", "moving.png", "--config", "no.yaml"], "no.yaml does not exist"),
         (None, ["fixed.png", "moving.png", "--device", "gpu"], "device must be one of auto, cpu, cuda"),
         (None, ["fixed.png", "moving.png", "--out", "fixed.png"], "fixed.png is not a folder"),
         (None, ["fixed.png"], "MOVING"),
