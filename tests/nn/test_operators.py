@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from torchdeform.nn.operators import div_curl_adjoint, div_curl_velocity, share_within_bounds
+from torchdeform.nn.operators import div_curl_adjoint, div_curl_velocity
 
 SPACING, WEIGHTS = [0.8, 1.0, 1.3], [1.0, 2.0, 0.1]
 

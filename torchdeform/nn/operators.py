@@ -38,7 +38,7 @@ def _factor(like: Tensor, spacing: Sequence[float], weights: Sequence[float], bo
 
 
 def _make_factor(
-    grid: Grid, weights: tuple[float, float, float], boundary: str, solver: str, dtype: torch.dtype, device: str
+    grid: Grid, weights: tuple[float, ...], boundary: str, solver: str, dtype: torch.dtype, device: torch.device
 ) -> Factor:
     system = DivCurlSystem(grid, Weights(*weights), boundary)
     with torch.inference_mode(False):
