@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -18,8 +19,8 @@ from torchdeform.core.derivatives import curl, jacobian_determinant
 from torchdeform.core.diagnostics import diagnose
 from torchdeform.core.flow import OdeSolver
 from torchdeform.core.grid import Grid
-from torchdeform.core.warp import compose, max_voxels
-from torchdeform.deformation.monitors import mean_value
+from torchdeform.core.warp import compose, max_voxels, sample
+from torchdeform.deformation.monitors import MonitorSettings, ball_monitor, mean_value, normalise_monitor
 from torchdeform.deformation.versions import (
     DeformationSettings,
     grid_from_initial_monitor,
@@ -558,3 +559,24 @@ def test_wrong_times_and_starts_are_refused():
     for corrections in (-1, 1.5):
         with pytest.raises(InputError, match="corrections must be 0 or more"):
             DeformationSettings(corrections=corrections)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("corrections", [0, 3])
+def test_a_map_that_is_worn_out_is_told(corrections):
+    """A spot goes round eight times. What slides is sheared; without corrections the errors add up and are told."""
+    grid = Grid((17, 17))
+
+    def spot(t: float) -> Tensor:
+        centre = [8 + 3.5 * math.cos(2 * math.pi * t), 8 + 3.5 * math.sin(2 * math.pi * t)]
+        return ball_monitor(grid, centre, 2.0, 1.5, MonitorSettings(f_min=0.5, dtype=torch.float64))
+
+    times = [k / 4 for k in range(33)]
+    settings = DeformationSettings(solver=OdeSolver(steps=2), corrections=corrections)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        shots = track_moving_monitor(spot, grid, times, settings=settings)
+    wanted = normalise_monitor(spot(times[-1]), grid, "reciprocal_mean")
+    there = sample(wanted, grid.points(dtype=torch.float64) + shots[-1], grid)
+    misfit = float((jacobian_determinant(shots[-1], grid) / there - 1).abs().mean())
+    assert (misfit > 0.01) == (corrections == 0) == bool(told)
+    assert all("J misses f by" in str(warning.message) for warning in told)

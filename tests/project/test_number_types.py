@@ -115,6 +115,12 @@ def test_results_do_not_follow_the_defaults(grid, name, other_default):
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["register", "align", "volumes", "solve"])
+def test_two_runs_give_the_same_bits(name):
+    """On one device with one number of threads, as the conventions say."""
+    assert torch.equal(_calls(GRIDS[0])[name](), _calls(GRIDS[0])[name]())
+
+
 def test_float64_goes_through(other_default):
     """With float64 inputs all is float64, and near what float32 gives."""
     fixed, moving = (_waves(GRIDS[0], shift) for shift in (0.0, 0.4))

@@ -11,6 +11,7 @@ Liu, Liao & Xue 2007, sections 2.1 to 2.3, where the denominator of Version 2 ha
 the equation above need the plus.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -18,6 +19,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from torchdeform.core.derivatives import jacobian_determinant
 from torchdeform.core.flow import OdeSolver, integrate_points, require_times
 from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid, common_batch, per_item
@@ -57,6 +59,9 @@ class DeformationSettings:
 
 _STILL = DeformationSettings()
 _MOVING = DeformationSettings(solver=OdeSolver(steps=4))
+
+# A misfit of Version 3 is told if it is this large, and so much larger than at the first time.
+_LARGE_MISFIT, _GROWTH = 0.01, 3.0
 
 
 def grid_from_initial_monitor(
@@ -177,14 +182,15 @@ def track_moving_monitor(
         div v = −∂t(1/f), dφ/dt = f(φ, t) v(φ, t), Liu, Liao & Xue 2007, section 2.3. 1/f is taken linear in time: from
         step to step for a callable, which is called once a step, and from time to time for a stack. For such f the
         equation above is exact, so J = f(φ, t) holds at the end of each step however long; the path of the nodes
-        between is of second order in the length. One velocity a step for a callable, one an interval for a stack.
-        Differentiable in the monitors, curl and start.
+        between is of second order in the length. Where motion goes on and on the nodes shear, and the grid holds the
+        map less and less well: a `RuntimeWarning` says so once J misses f by 1 % on average, three times as at first.
+        One velocity a step for a callable, one an interval for a stack. Differentiable in the monitors, curl and start.
     """
     times, solver = _checked_times(f_of_t, times), settings.solver
     parts, solver = (solver.steps, replace(solver, steps=1)) if callable(f_of_t) else (1, solver)
     now = _density_at(f_of_t, grid, times, times[0])
     u = _first_displacement(start, now, grid, velocity, settings)
-    shots = [u]
+    shots, first = [u], _misfit(u, now, grid)
     for begin, end in pairwise(times):
         moments = [begin + (end - begin) * part / parts for part in range(parts)]
         for earlier, later in pairwise([*moments, end]):
@@ -194,7 +200,26 @@ def track_moving_monitor(
             u, now = _follow(u, now, then, v, grid, solver), then
         u = _finish(u, torch.ones_like(now), now, grid, settings)
         shots.append(u)
+        _warn_of_loss(_misfit(u, now, grid), first, end)
     return torch.stack(torch.broadcast_tensors(*shots))
+
+
+@torch.no_grad()
+def _misfit(u: Tensor, density: Tensor, grid: Grid) -> float:
+    """Return the mean of |J(φ)/f(φ) − 1| over the nodes of the worst item, 1/f being the density."""
+    nodes = grid.points(dtype=u.dtype, device=u.device)
+    error = (jacobian_determinant(u, grid) * sample(density, nodes + u, grid) - 1).abs()
+    return float(error.flatten(1).mean(1).amax())
+
+
+def _warn_of_loss(misfit: float, first: float, time: float) -> None:
+    """Say so where a map has come to be too distorted for its grid to hold what is asked for."""
+    if misfit > max(_LARGE_MISFIT, _GROWTH * first):
+        text = (
+            f"track_moving_monitor: J misses f by {misfit:.2g} on average at time {time:g}, by {first:.2g} at first: "
+            "the map is too distorted for the grid; take more nodes, or begin anew, without start, before that time"
+        )
+        warnings.warn(text, RuntimeWarning, stacklevel=3)
 
 
 def _from_identity(

@@ -65,7 +65,8 @@ class RandomDeformation(nn.Module):
 
     Notes:
         Ω is mapped onto Ω, and no map has folds by the full certificate. The noise is drawn on the CPU from the given
-        generator, or from torch's, so the same seed gives the same maps on every device. Not differentiable in what is
+        generator, or from torch's, so the same seed gives the same maps on every device, to
+        rounding. Not differentiable in what is
         random; images keep their gradient.
     """
 

@@ -250,7 +250,7 @@ def _parameter_gradients(
         rest = iter(chosen)
         return apply(x, *(next(rest) if w else p for p, w in zip(parameters, wanted, strict=True)))
 
-    pull = torch.func.vjp(product, *(p for p, w in zip(parameters, wanted, strict=True) if w))[1]
+    _, pull, *_ = torch.func.vjp(product, *(p for p, w in zip(parameters, wanted, strict=True) if w))
     found = iter(pull(-adjoint))
     return [next(found) if w else None for w in wanted]
 
