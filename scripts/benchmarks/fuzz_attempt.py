@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -76,16 +77,22 @@ def _family() -> Iterator[Path]:
     """Yield the folders of this process and of its children in the kernel's list."""
     yield _SELF
     for task in (_SELF / "task").iterdir():
-        yield from (Path("/proc") / child for child in (task / "children").read_text(encoding="ascii").split())
+        with suppress(OSError):  # a thread that has ended
+            yield from (Path("/proc") / child for child in (task / "children").read_text(encoding="ascii").split())
 
 
 def _reset_peaks() -> None:
     """Let the peaks of memory start again from what is held now."""
     for process in _family():
-        (process / "clear_refs").write_text("5", encoding="ascii")
+        with suppress(OSError):
+            (process / "clear_refs").write_text("5", encoding="ascii")
 
 
 def _held(name: str) -> int:
     """Return the bytes that this process and its children hold (``VmRSS``) or held at most (``VmHWM``)."""
-    lines = [line.split() for p in _family() for line in (p / "status").read_text(encoding="utf-8").splitlines()]
-    return sum(1024 * int(words[1]) for words in lines if words[:1] == [f"{name}:"])
+    total = 0
+    for process in _family():
+        with suppress(OSError):
+            lines = (process / "status").read_text(encoding="utf-8").splitlines()
+            total += sum(1024 * int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
+    return total

@@ -368,7 +368,7 @@ engine: {timeout: 3600.0, workers: 2}
 _PATTERN = r"""out: results
 pairs:
   pattern:
-    expression: (?P<subject>[a-z]+\d{2,4})/(?P<session>ses-(\d+|x))_T1w\.nii(\.gz)?
+    expression: (?P<subject>[a-z]+\d{2,4})_(?P<session>ses-(\d+|x))_T1w\.nii(\.gz)?
     folder: .
     pairing: all
     within: [subject]
@@ -395,6 +395,13 @@ _JOURNAL = "\n".join(
         {"pair": "a", "key": "cd" * 32, "status": "done", "files": ["result.json"], "seconds": 1.5},
     )
 )
+
+
+def _pattern(path: Path) -> None:
+    """Write a cohort file, and beside it the images that it finds."""
+    _write(path, _PATTERN)
+    for session in "12":
+        _write(path.with_name(f"ab12_ses-{session}_T1w.nii.gz"), "no image")
 
 
 def _tiff(**options: Any) -> Callable[[Path], None]:
@@ -453,7 +460,7 @@ FORMATS: dict[str, Format] = {
     "Learn2Reg": Format("T_dataset.json", _words(_LEARN2REG), partial(read_around, "learn2reg")),
     "settings": Format("a.yaml", _words(_SETTINGS), read_settings),
     "cohort": Format("cohort.yaml", _words(_COHORT), read_cohort),
-    "cohort, expression": Format("cohort.yaml", _words(_PATTERN), read_cohort),
+    "cohort, expression": Format("cohort.yaml", _pattern, read_cohort),
     "record": Format("result.json", _words(_RECORD), read_record),
     "journal": Format("journal.jsonl", _words(_JOURNAL), read_journal),
 }

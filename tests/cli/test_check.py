@@ -45,6 +45,18 @@ def test_the_verb_shows_both_images(run):
     assert "register will choose: similarity lncc: the images have one contrast" in out
 
 
+def test_the_verb_looks_at_landmarks_and_labels(run, tmp_path):
+    (tmp_path / "inside.csv").write_text("x,y,z\n1,2,3\n", encoding="utf-8")
+    (tmp_path / "outside.csv").write_text("x,y,z\n900,2,3\n", encoding="utf-8")
+    labels = ["--fixed-labels", "far.nrrd", "--moving-labels", "fixed.nii.gz"]
+    code, out, _ = run("fixed.nii.gz", "fixed.nii.gz", "--fixed-points", "inside.csv", "--moving-points", "outside.csv")
+    assert code == 2
+    assert "error: 1 of 1 points of outside.csv lie outside of fixed.nii.gz, the farthest by" in out
+    code, out, _ = run("fixed.nii.gz", "fixed.nii.gz", *labels)
+    assert code == 2
+    assert "error: far.nrrd lies beside fixed.nii.gz" in out
+
+
 def test_the_verb_warns_and_draws(run, tmp_path):
     code, out, _ = run("fixed.nii.gz", "flipped.mha", "--out", "new/overlay.png")
     assert code == 0

@@ -5,7 +5,8 @@ from cohort_files import BIDS
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchdeform.cohort.patterns import fill_parts, find, literal, part_names, single_file
+import torchdeform.cohort.patterns as patterns
+from torchdeform.cohort.patterns import fill_parts, find, literal, part_names, search, single_file
 from torchdeform.errors import InputError
 
 
@@ -60,3 +61,23 @@ def test_one_file_must_match(touch):
         single_file(f"{folder}/a*")
     with pytest.raises(InputError, match="must match one file, but no file matches"):
         single_file(f"{folder}/b*")
+
+
+def test_repetitions_in_repetitions_take_bounded_time(touch, monkeypatch):
+    """Python's own matching of this takes years."""
+    monkeypatch.setattr(patterns, "_SECONDS", 0.5)
+    folder = touch(["a" * 60 + ".png"])
+    with pytest.raises(InputError, match=r"'\(a\+\)\+\$' takes too long to match; write it without repetitions"):
+        search(folder, "(a+)+$")
+    assert [one.path.name for one in search(folder, r"(?P<x>a)a+\.png")] == ["a" * 60 + ".png"]
+
+
+@pytest.mark.parametrize("expression", ["(", "a{99999999999}", "(" * 5000 + ")" * 5000, "(?P<1>a)", "a" * 20_000])
+def test_expressions_that_are_none(touch, expression):
+    with pytest.raises(InputError, match="is no regular expression|write a shorter expression") as raised:
+        search(touch(["a.png"]), expression)
+    assert len(str(raised.value)) < 300
+
+
+def test_expressions_that_python_warns_of(touch):
+    assert [one.path.name for one in search(touch(["[a.png"]), r"[[]a\.png")] == ["[a.png"]

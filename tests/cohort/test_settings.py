@@ -1,9 +1,12 @@
 """Settings of a cohort: contradictions are refused, variables are filled in."""
 
+from pathlib import Path
+
 import pytest
 from pydantic import ValidationError
 
-from torchdeform.cohort.settings import EngineSettings, expand
+from torchdeform.cohort.settings import EngineSettings, absolute_path, expand
+from torchdeform.errors import InputError
 
 
 @pytest.mark.parametrize(
@@ -22,11 +25,21 @@ from torchdeform.cohort.settings import EngineSettings, expand
         ({"timeout": float("inf")}, "less than or equal to"),
         ({"timeout": float("nan")}, "less than or equal to"),
         ({"timeout": 1e300}, "less than or equal to"),
+        ({"workers": 2**62}, "less than or equal to 1000000"),
     ],
 )
 def test_settings_that_contradict_are_refused(settings, sentence):
     with pytest.raises(ValidationError, match=sentence):
         EngineSettings(**settings)
+
+
+@pytest.mark.parametrize(
+    ("path", "sentence"),
+    [("~nosuchuser/a.nii", "'~nosuchuser/a.nii': there is no user of this name"), ("a" * 5000, "longer than a path")],
+)
+def test_paths_that_lead_nowhere(path, sentence):
+    with pytest.raises(InputError, match=sentence):
+        absolute_path(Path("/data"), path)
 
 
 def test_expanding_leaves_other_text_alone(monkeypatch):

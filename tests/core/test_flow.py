@@ -344,3 +344,31 @@ def test_the_stand_in_gives_way_to_the_module():
     stand_in = flow._StandIn("scipy.integrate")
     assert stand_in.quad(lambda x: 2 * x, 0, 1)[0] == pytest.approx(1.0)
     assert not isinstance(sys.modules["scipy.integrate"], flow._StandIn)
+
+
+def test_dopri5_gives_up_in_bounded_time():
+    """10⁴ voxels a unit of time along a shear that turns at every node: it would go on for hours."""
+    grid = Grid((6, 6))
+    v = 1e4 * torch.sin(2 * grid.points()).flip(1)
+    with pytest.raises(
+        ComputationError, match=f"dopri5 is not there after {flow.MOST_STEPS} steps.*raise atol, or take"
+    ):
+        integrate(v, grid, method="dopri5")
+    assert integrate(v, grid, method="rk4").isfinite().all()
+
+
+def test_torchdiffeq_may_be_imported_under_a_mode():
+    """Its tables would be fake, or on the default device, for good."""
+    code = (
+        "import torch, torchdeform as td\n"
+        "from torch._subclasses.fake_tensor import FakeTensorMode\n"
+        "grid, v = td.Grid((8, 8)), torch.rand(1, 2, 8, 8)\n"
+        "with FakeTensorMode(allow_non_fake_inputs=True), torch.device('meta'):\n"
+        "    try:\n"
+        "        td.integrate(v, grid, method='dopri5')\n"
+        "    except RuntimeError:\n"
+        "        pass\n"
+        "assert td.integrate(v, grid, method='dopri5').isfinite().all()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

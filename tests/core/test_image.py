@@ -15,6 +15,7 @@ from torchdeform.core.image import (
     orientation,
     overlap,
     require_registrable,
+    require_same_place,
     resample,
     surroundings,
 )
@@ -203,3 +204,10 @@ def test_orientation_codes(direction, letters, oblique):
     dim = len(direction)
     image = Image(torch.rand(1, 1, *[3] * dim), Grid((3,) * dim), direction=direction)
     assert (orientation(image), is_oblique(image)) == (letters, oblique)
+
+
+def test_another_spacing_is_another_place(make_image):
+    image = make_image((8, 9), (1.0, 1.0))
+    require_same_place(image, replace(image, grid=Grid((8, 9), (1.0, 1.0 + 1e-5))))
+    with pytest.raises(InputError, match=r"must lie in one place, but their headers put them 8 mm apart"):
+        require_same_place(image, replace(image, grid=Grid((8, 9), (1.0, 2.0))))

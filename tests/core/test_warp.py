@@ -251,3 +251,8 @@ def test_wrong_input_is_refused():
         compose(u, u[..., :-1], grid)
     with pytest.raises(InputError, match="invert: u"):
         invert(image, grid)
+
+
+def test_no_points_have_no_values():
+    grid = Grid((5, 6))
+    assert sample(torch.rand(2, 3, 5, 6), torch.zeros(2, 2, 0), grid).shape == (2, 3, 0)

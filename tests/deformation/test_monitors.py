@@ -305,8 +305,23 @@ def test_wrong_densities_and_labels_are_refused():
             label_monitor(labels, factors, grid)
     with pytest.raises(InputError, match="label 3 does not occur"):
         label_monitor(labels, {3: 1.1}, grid)
-    for factors in ({1: 9.0}, {0: 1.1, 1: 0.9}):
-        with pytest.raises(InputError, match="leave the rest of the domain no volume"):
-            label_monitor(labels, factors, grid)
+    with pytest.raises(InputError, match="leave the rest of the domain no volume"):
+        label_monitor(labels, {1: 9.0}, grid)
+    with pytest.raises(InputError, match=r"labels fill the domain, and the factors would make its volume 1\.\d+ times"):
+        label_monitor(labels, {0: 1.1, 1: 0.9}, grid)
+    with pytest.raises(InputError, match="the labels fill item 1 of the batch, so nothing takes up the slack"):
+        label_monitor(torch.cat([labels, torch.ones_like(labels)]), {1: 0.9}, grid)
     with pytest.raises(InputError, match="label_monitor: labels must have shape"):
         label_monitor(labels[0], {1: 1.1}, grid)
+
+
+@pytest.mark.parametrize("monitor", [gradient_monitor, curvature_monitor, density_monitor, normalise_monitor])
+@pytest.mark.parametrize("size", [1e30, 1e-30])
+def test_the_unit_of_an_image_does_not_matter(monitor, size):
+    grid = Grid((12, 14))
+    image = torch.rand(2, 1, *grid.shape) + 0.5
+    expected = monitor(image, grid) * (size if monitor is normalise_monitor else 1)
+    found = monitor(image * size, grid)
+    if monitor is normalise_monitor:
+        expected = expected / size
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)

@@ -15,6 +15,7 @@ from torchdeform.core.derivatives import determinant, jacobian_determinant
 from torchdeform.core.diagnostics import diagnose
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import sample
+from torchdeform.deformation.monitors import label_monitor
 from torchdeform.deformation.volumes import nodal_volumes, simulate_volume_change
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.fem.boundary import fixed_unknowns
@@ -242,7 +243,7 @@ SPOT[..., 3:9, 3:9] = 7
         (SPOT, {7: math.nan}, {}, "factors must be positive"),
         (SPOT, {8: 0.9}, {}, "label 8 does not occur"),
         (SPOT, {7: 5.0}, {}, "leave the rest of the domain no volume"),
-        (SPOT, {7: 0.9, 0: 1.0}, {}, "leave the rest of the domain no volume"),
+        (SPOT, {7: 0.9, 0: 1.0}, {}, r"labels fill the domain, and the factors would make its volume 0\.\d+ times"),
         (SPOT, {7: 0.9}, {"rigid_mask": SPOT == 7}, "label 7 lies in rigid_mask"),
         (SPOT, {7: 0.9}, {"rigid_mask": SPOT}, "must be a mask of bool"),
         (SPOT, {7: 0.9}, {"rigid_mask": SPOT[..., :3] == 0}, "rigid_mask must have shape"),
@@ -254,3 +255,27 @@ SPOT[..., 3:9, 3:9] = 7
 def test_wrong_input_is_refused(labels, factors, options, message):
     with pytest.raises(InputError, match=message):
         simulate_volume_change(labels, factors, PLANE, **options)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_labels_may_fill_the_domain_where_the_factors_keep_its_volume(grid):
+    labels = torch.ones(1, 1, *grid.shape, dtype=torch.int64)
+    labels[:, :, grid.shape[0] // 2 :] = 2
+    share = float(grid.quadrature(dtype=torch.float64)[labels == 1].sum()) / grid.volume
+    factors = {1: 0.8, 2: (1 - 0.8 * share) / (1 - share)}
+    change = simulate_volume_change(labels, factors, grid)
+    assert change.ok
+    assert {label: float(f) for label, f in change.factors.items()} == pytest.approx(factors, rel=1e-3)
+    assert float(change.smallest) > 0
+    torch.testing.assert_close(
+        label_monitor(labels, factors, grid)[labels == 1], torch.full((int((labels == 1).sum()),), 0.8)
+    )
+
+
+def test_one_label_that_fills_the_domain_stays():
+    everything = torch.ones(1, 1, 12, 12, dtype=torch.int64)
+    assert simulate_volume_change(everything, {1: 1.0}, PLANE).value.abs().max() == 0
+    with pytest.raises(InputError, match=r"would make its volume 0\.9 times as large; leave out a label"):
+        simulate_volume_change(everything, {1: 0.9}, PLANE)
+    with pytest.raises(InputError, match="the labels fill item 1 of the batch"):
+        simulate_volume_change(torch.cat([SPOT, 0 * SPOT + 7]), {7: 0.9}, PLANE)

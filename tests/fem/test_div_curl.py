@@ -370,7 +370,7 @@ DIV2 = torch.zeros(1, 1, 4, 5)
         ((torch.zeros(1, 1, 4, 5, 3), torch.zeros(1, 1, 4, 5, 3), GRID3), r"curl must have shape \(B, 3, 4, 5, 3\)"),
         ((torch.zeros(4, 5), None, GRID2), r"div must have shape \(B, 1, 4, 5\)"),
         ((DIV2.long(), None, GRID2), "div must be a floating-point tensor"),
-        ((DIV2.half(), None, GRID2), "all must be float32, or all float64"),
+        ((DIV2.half(), None, GRID2), r"of 32 or 64 bits, got torch.float16; convert it with .float\(\)"),
         ((DIV2, DIV2.double(), GRID2), "all must be float32, or all float64"),
         ((torch.zeros(2, 1, 4, 5), torch.zeros(3, 1, 4, 5), GRID2), r"batch sizes must agree or be 1, got \[2, 3\]"),
         ((None, None, GRID2), "nothing to solve for"),
@@ -429,3 +429,28 @@ def test_a_field_given_by_its_own_load_comes_back():
         solution = solve_div_curl(div, curl, grid, boundary, boundary_values=v, weights=Weights(2.0, 3.0))
         torch.testing.assert_close(solution.value, v, atol=1e-8, rtol=0)
     assert assemble_load(div_curl_form(2, Weights()), torch.cat([div, curl], dim=1), grid).shape == v.shape
+
+
+@pytest.mark.parametrize(("dtype", "size"), [(torch.float32, 1e30), (torch.float32, 1e-30), (torch.float64, 1e200)])
+@pytest.mark.parametrize("solver", ["transform", "cg", "assembled"])
+@pytest.mark.parametrize("grid", [GRID2, GRID3])
+def test_the_unit_of_the_data_does_not_matter(grid, solver, dtype, size):
+    """The squares in a norm of 1e200 overflow, those of 1e-30 in float32 vanish: that says nothing of v."""
+    x = grid.points(dtype=dtype)
+    div, turn = torch.sin(x).sum(1, keepdim=True), torch.cos(x)[:, : 2 * grid.dim - 3]
+    expected = solve_div_curl(div, turn, grid, solver=solver)
+    found = solve_div_curl(size * div, size * turn, grid, solver=solver)
+    assert found.status == expected.status == (Status.CONVERGED,)
+    torch.testing.assert_close(
+        found.value / size, expected.value, rtol=1e-4, atol=1e-4 * float(expected.value.abs().max())
+    )
+    assert found.residual.item() == pytest.approx(expected.residual.item(), abs=1e-5)
+
+
+@pytest.mark.parametrize("solver", ["transform", "cg"])
+def test_what_is_beyond_all_numbers_is_said(solver):
+    div = torch.full((1, 1, *GRID2.shape), 3e38).cos() * 3e38
+    div[..., 2:] = math.inf
+    found = solve_div_curl(div, None, GRID2, solver=solver)
+    assert found.status == (Status.NON_FINITE,)
+    assert found.residual.isnan().all()

@@ -1,6 +1,7 @@
 """Headers of DICOM: recognised with or without magic bytes, and read safely whatever is in them."""
 
 import random
+import re
 import struct
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from contextlib import suppress
 import numpy as np
 import pydicom
 import pytest
+import SimpleITK as sitk
 from dicom_files import enhanced, item, picture, save, volume
 from pydicom.uid import (
     DeflatedExplicitVRLittleEndian,
@@ -20,7 +22,7 @@ from pydicom.uid import (
 
 from torchdeform.errors import InputError
 from torchdeform.io import read_image
-from torchdeform.io.dicom_header import is_dicom, slices
+from torchdeform.io.dicom_header import is_dicom, read
 from torchdeform.io.images import image_size
 
 SYNTAXES = [ExplicitVRLittleEndian, ImplicitVRLittleEndian, ExplicitVRBigEndian, DeflatedExplicitVRLittleEndian]
@@ -133,6 +135,38 @@ def test_a_hostile_file_ends_no_process(tmp_path):
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    "start",
+    [
+        struct.pack("<HH2sHI", 8, 0x1140, b"SQ", 0, 0xFFFFFFFF) + struct.pack("<HHI", 0xFFFE, 0xE000, 0xFFFFFFFF),
+        struct.pack("<HHI", 8, 0x1140, 0xFFFFFFFF) + struct.pack("<HHI", 0xFFFE, 0xE000, 0xFFFFFFFF),
+        b"\x08\0anything",
+    ],
+)
+@pytest.mark.parametrize("name", ["a.dcm", "a.mha", "a"])
+def test_what_itk_would_take_for_dicom_never_reaches_it(tmp_path, name, start):
+    """ITK shows every file to GDCM, which crashes at some without magic bytes."""
+    (tmp_path / name).write_bytes(start * 20_000)
+    with pytest.raises(InputError, match=re.escape(name)):
+        read_image(tmp_path / name)
+    assert image_size(tmp_path / name) is None
+
+
+def test_a_header_that_keeps_pydicom_busy_is_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr("torchdeform.io.dicom_header.SECONDS", 0.5)
+    (tmp_path / "a").write_bytes((b"DICM" + struct.pack("<HH2sHI", 8, 0x1140, b"SQ", 0, 0xFFFFFFFF)) * 20_000)
+    with pytest.raises(InputError, match=r"a keeps its reader busy for more than \d s, so it is damaged"):
+        read_image(tmp_path / "a")
+
+
+def test_a_volume_of_512_columns_of_another_format(tmp_path):
+    """Its first two bytes are those of DICOM without a preamble."""
+    image = sitk.Image([512, 3, 2], sitk.sitkUInt8)
+    sitk.WriteImage(image, str(tmp_path / "a.gipl"))
+    assert (tmp_path / "a.gipl").read_bytes().startswith(b"\x02\0")
+    assert read_image(tmp_path / "a.gipl").grid.shape == (2, 3, 512)
+
+
 def test_what_is_packed_small_and_becomes_large(tmp_path, monkeypatch):
     path = save(picture(GREY), tmp_path / "a.dcm", DeflatedExplicitVRLittleEndian)
     content = path.read_bytes()
@@ -141,7 +175,7 @@ def test_what_is_packed_small_and_becomes_large(tmp_path, monkeypatch):
     path.write_bytes(content[:start] + packer.compress(bytes(200_000_000)) + packer.flush())
     monkeypatch.setattr("torchdeform.io.gate.available", lambda: 50_000_000)
     with pytest.raises(InputError, match=r"takes, by its header, .* of memory and 50 MB are free"):
-        slices(path)
+        read(path)
 
 
 def test_headers_say_no_pixels_that_are_not_there(tmp_path, monkeypatch):

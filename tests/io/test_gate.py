@@ -88,6 +88,7 @@ def test_what_a_header_announces_must_be_there_and_fit(tmp_path, monkeypatch):
     require_room(file, 1_000_000_000)
     with pytest.raises(InputError, match=r"announces 2 GB of pixels, far more than it can hold; it is damaged"):
         require_room(file, 2_000_000_000)
+    require_room(file, 2_000_000_000, stored=2_000_000)  # in other files
     monkeypatch.setattr(gate, "available", lambda: 500_000_000)
     with pytest.raises(InputError, match=r"takes, by its header, 1 GB of memory and 500 MB are free"):
         require_room(file, 1_000_000_000)

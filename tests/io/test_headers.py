@@ -6,6 +6,7 @@ import os
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 
 import pytest
 
@@ -38,7 +39,7 @@ def test_sizes(text, rank, found):
     ],
 )
 def test_sizes_that_cannot_be(text, rank):
-    with pytest.raises(InputError, match=r"a\.mhd has the size"):
+    with pytest.raises(InputError, match=r"a\.mhd has the (size|number of axes)"):
         headers.sizes(PATH, text, rank)
 
 
@@ -118,12 +119,24 @@ def test_bytes_before_the_pixels_do_not_count(tmp_path):
 
 
 @pytest.mark.parametrize("packing", ["gzip", "bzip2"])
-def test_what_is_packed_is_counted_piece_by_piece(tmp_path, packing, monkeypatch):
-    monkeypatch.setattr(headers, "_CHUNK", 1000)
-    content = {"gzip": gzip.compress, "bzip2": bz2.compress}[packing](os.urandom(100_000))
+@pytest.mark.parametrize("chunks", [(1000, 1000), (100, 5000), (5000, 100), (1 << 22, 1 << 18)])
+@pytest.mark.parametrize("pattern", ["noise", "zeros", "words"])
+def test_what_is_packed_is_counted_piece_by_piece(tmp_path, packing, chunks, pattern, monkeypatch):
+    """However much is in the file, in the unpacker and in a piece."""
+    for name, size in zip(("_CHUNK", "_PACKED"), chunks, strict=True):
+        monkeypatch.setattr(headers, name, size)
+    pixels = {"noise": Random(0).randbytes(100_000), "zeros": bytes(100_000), "words": bytes(range(200)) * 500}[pattern]
+    content = {"gzip": gzip.compress, "bzip2": bz2.compress}[packing](pixels)
     _header(tmp_path, packing, content, size=(100, 100, 10)).require_complete()
     with pytest.raises(InputError, match="is damaged"):
         _header(tmp_path, packing, content, size=(100, 100, 11)).require_complete()
+
+
+def test_several_gzip_in_a_row_are_one(tmp_path):
+    content = gzip.compress(bytes(20)) + gzip.compress(bytes(4))
+    _header(tmp_path, "gzip", content).require_complete()
+    with pytest.raises(InputError, match="is damaged"):
+        _header(tmp_path, "gzip", content, size=(5, 5, 1)).require_complete()
 
 
 def test_pixels_that_cannot_be_there(tmp_path):

@@ -89,3 +89,12 @@ def test_labels_of_one_image_only_or_of_another_place(folder, capfd):
     assert "--moving-labels" in refused(folder, capfd, "sound.nii.gz", "sound.nii.gz", "--fixed-labels", "good.nii")
     options = ["--fixed-labels", "bad.nii", "--moving-labels", "good.nii"]
     assert "no label in common" in refused(folder, capfd, "sound.nii.gz", "sound.nii.gz", *options)
+
+
+@pytest.mark.parametrize("ending", [".tif", ".nii.gz", ".mha", ".nrrd"])
+@pytest.mark.parametrize("kind", ["int32", "uint32"])
+def test_every_label_of_wide_integers_is_kept(tmp_path, ending, kind):
+    values = np.zeros((20, 24), kind)
+    values[5:9], values[9:12] = 2**24 + 1, 2**24 + 2
+    sitk.WriteImage(sitk.GetImageFromArray(values), str(tmp_path / f"labels{ending}"))
+    np.testing.assert_array_equal(read_labels(tmp_path / f"labels{ending}").data[0, 0], values)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from broken_files import SHAPE, meta_image, nrrd_image, save, volume
 
-from torchdeform.io.kinds import kind_of
+from torchdeform.io.kinds import kind_of, known_otherwise
 
 WRITTEN = {
     "a.nii": "nifti", "a.nii.gz": "nifti", "a.mha": "meta", "a.mhd": "meta", "a.nrrd": "nrrd", "a.nhdr": "nrrd",
@@ -61,3 +61,11 @@ def test_what_nibabel_writes(tmp_path, make, kind, packed):
 def test_kinds_by_content(tmp_path, content, kind):
     (tmp_path / "x.png").write_bytes(content)
     assert kind_of(tmp_path / "x.png") == kind
+
+
+@pytest.mark.parametrize(
+    ("content", "what"), [(b"PK\3\4", "is a ZIP archive"), (b"<HTML>", "is a web page"), (b"words", "")]
+)
+def test_what_is_no_image_at_all(tmp_path, content, what):
+    (tmp_path / "x").write_bytes(content)
+    assert known_otherwise(tmp_path / "x").startswith(what)

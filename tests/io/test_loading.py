@@ -45,3 +45,21 @@ def test_errors_are_returned_quietly():
     assert isinstance(error, RuntimeError)
     assert reason(error) == "It failed"
     assert reason(RuntimeError("")) == "no reason given"
+
+
+def test_announced_sizes_are_checked_before_pixels_are_read(tmp_path):
+    head = "# vtk DataFile Version 3.0\nx\nBINARY\nDATASET STRUCTURED_POINTS\nDIMENSIONS 5000 5000 5000\n"
+    rest = "SPACING 1 1 1\nORIGIN 0 0 0\nPOINT_DATA 125000000000\nSCALARS s unsigned_char 1\nLOOKUP_TABLE default\n"
+    (tmp_path / "a.vtk").write_bytes((head + rest).encode() + bytes(1000))
+    with pytest.raises(InputError, match="announces 125 GB of pixels, far more than it can hold"):
+        read_by_itk(tmp_path / "a.vtk")
+
+
+def test_vectors_on_a_fourth_axis(tmp_path):
+    values = np.random.default_rng(0).random((3, 4, 5, 6)).astype(np.float32)
+    sitk.WriteImage(sitk.GetImageFromArray(values, isVector=False), str(tmp_path / "a.mha"))
+    found = read_by_itk(tmp_path / "a.mha", "", True)
+    np.testing.assert_array_equal(np.moveaxis(found.values, -1, 0), values)
+    assert (found.stacked, found.size, len(found.spacing), found.direction.shape) == (True, (6, 5, 4), 3, (3, 3))
+    with pytest.raises(InputError, match="is a series of 3 volumes"):
+        read_by_itk(tmp_path / "a.mha")

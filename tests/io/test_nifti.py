@@ -172,6 +172,14 @@ def test_a_spoilt_qform_beside_an_sform_does_no_harm(tmp_path):
     _require_alike(path, read_image(path))
 
 
+@pytest.mark.parametrize("rows", [[0.0] * 12, [np.nan] * 12, [1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0]])
+def test_an_sform_without_sense_leaves_the_qform(tmp_path, rows):
+    expected = read_image(_save(tmp_path / "a.nii", codes=(1, 0)))
+    image = read_image(_changed(_save(tmp_path / "b.nii"), "<12f", 280, *rows))
+    assert (image.grid, image.origin, image.direction) == (expected.grid, expected.origin, expected.direction)
+    assert "has an sform without sense; the qform is used" in image.remarks[0]
+
+
 def test_an_sform_of_another_voxel_size_is_said(tmp_path):
     path = _changed(_save(tmp_path / "a.nii", codes=(0, 1)), "<3f", 80, 3, 3, 3)
     image = read_image(path)
@@ -239,8 +247,8 @@ def test_labels_keep_every_value(tmp_path, kind):
 WRONG: dict[str, tuple[Callable[[Path], Path], str]] = {
     "quaternion": (lambda p: _changed(_save(p, codes=(1, 0)), "<3f", 256, 2, 0, 0), "a qform that is no rotation"),
     "NaN in the qform": (lambda p: _changed(_save(p, codes=(1, 0)), "<f", 256, np.nan), "a qform that is no rotation"),
-    "NaN in the sform": (lambda p: _changed(_save(p), "<f", 280, np.nan), "NaN or infinite numbers in its affine"),
-    "flat sform": (lambda p: _changed(_save(p), "<12f", 280, *[0.0] * 12), "an affine that is singular"),
+    "NaN in the sform": (lambda p: _changed(_save(p, codes=(0, 1)), "<f", 280, np.nan), "NaN or infinite numbers"),
+    "flat sform": (lambda p: _changed(_save(p, codes=(0, 1)), "<12f", 280, *[0.0] * 12), "affine that is singular"),
     "intercept": (lambda p: _changed(_save(p), "<2f", 112, 2, np.nan), "the intercept nan"),
     "type": (lambda p: _changed(_save(p), "<h", 70, 1), "pixels of the type 1, which is unknown"),
     "complex": (lambda p: _save(p, values=VALUES.astype(np.complex64)), "complex numbers"),
@@ -273,3 +281,13 @@ def test_pixels_need_no_offset(tmp_path):
     path = _save(tmp_path / "a.nii")
     expected = read_nifti(path).values
     np.testing.assert_array_equal(read_nifti(_changed(path, "<f", 108, 0.0)).values, expected)
+
+
+def test_vectors_on_the_fourth_axis(tmp_path):
+    vectors = np.random.default_rng(0).random((5, 6, 7, 3)).astype(np.float32)
+    path = _save(tmp_path / "a.nii", values=vectors, intent_code=1006)
+    found = read_nifti(path, vectors=True)
+    np.testing.assert_array_equal(found.values.swapaxes(0, 2), vectors)
+    assert (found.stacked, found.intent) == (True, 1006)
+    with pytest.raises(InputError, match="a series of 3 volumes"):
+        read_nifti(path)

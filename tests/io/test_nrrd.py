@@ -117,3 +117,8 @@ def test_comments_and_keys_of_the_user_have_no_say(tmp_path):
     path = _written(tmp_path, head + volume().tobytes())
     assert nrrd_header(path).size == (11, 10, 9)
     np.testing.assert_array_equal(read_image(path).data[0, 0], volume())
+
+
+def test_axes_in_different_units_are_refused(tmp_path):
+    with pytest.raises(InputError, match="has axes in different units"):
+        read_image(_written(tmp_path, nrrd_image(space_units='"um" "um" "mm"')))

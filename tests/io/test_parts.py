@@ -3,9 +3,9 @@
 import os
 from pathlib import Path
 
+import dicom_files
 import numpy as np
 import pytest
-import SimpleITK as sitk
 from broken_files import meta_image, nrrd_image, save, volume
 
 from torchdeform.errors import InputError
@@ -63,10 +63,14 @@ def test_both_files_of_a_pair_from_either(tmp_path):
 
 
 def test_a_folder_of_slices(tmp_path):
-    for k in range(3):
-        sitk.WriteImage(sitk.GetImageFromArray(volume("int16", (30, 40))), str(tmp_path / f"{k}.dcm"))
+    """A slice of a volume is read with its series; other files of the folder have no part in it."""
+    dicom_files.single(tmp_path, dicom_files.volume(9))
+    slices = sorted(path.name for path in tmp_path.iterdir())
+    dicom_files.save(dicom_files.picture(dicom_files.volume(1)[0], SeriesInstanceUID="1.2.4"), tmp_path / "other.dcm")
     (tmp_path / "notes.txt").write_text("no slice", encoding="utf-8")
-    assert _names(tmp_path) == _names(tmp_path / "1.dcm") == ["0.dcm", "1.dcm", "2.dcm"]
+    assert _names(tmp_path / slices[3]) == slices
+    assert _names(tmp_path / "other.dcm") == ["other.dcm"]
+    assert _names(tmp_path) == sorted([*slices, "other.dcm"])
 
 
 def test_the_files_of_an_ome_tiff(tmp_path):
@@ -74,11 +78,13 @@ def test_the_files_of_an_ome_tiff(tmp_path):
     xml = (
         '<?xml version="1.0"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06"><TiffData>'
         '<UUID FileName="a.ome.tif">1</UUID><UUID FileName="b.ome.tif">2</UUID>'
-        '<UUID FileName="../c.tif">3</UUID></TiffData></OME>'
+        "</TiffData></OME>"
     )
     for name in ("a.ome.tif", "b.ome.tif"):
         tifffile.imwrite(tmp_path / name, volume("uint8", (30, 40)), description=xml, metadata=None)
     assert _names(tmp_path / "a.ome.tif") == ["a.ome.tif", "b.ome.tif"]
+    tifffile.imwrite(tmp_path / "a.ome.tif", volume("uint8", (30, 40)), description=xml.replace("b.", "../b."))
+    assert _names(tmp_path / "a.ome.tif") == ["a.ome.tif"]
 
 
 @pytest.mark.parametrize(

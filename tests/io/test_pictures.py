@@ -150,6 +150,13 @@ def test_the_fourth_byte_of_a_bmp_is_alpha_if_it_is_used(tmp_path, upwards, used
     assert np.array_equal(read_image(tmp_path / "a.bmp").data[0].numpy(), wanted)
 
 
+@pytest.mark.parametrize("form", ["GIF", "WEBP", "PNG", "JPEG", "BMP", "JPEG2000"])
+def test_lines_are_refused(tmp_path, form):
+    PIL.new("L", (300, 1)).save(tmp_path / "a", form)
+    with pytest.raises(InputError, match=r"a has size \[300, 1\]; give an image with at least two axes"):
+        read_image(tmp_path / "a")
+
+
 @pytest.mark.parametrize("form", ["GIF", "WEBP", "PNG"])
 def test_films_are_refused(tmp_path, form):
     frames = [PIL.fromarray(np.roll(smooth(3), k, 0)) for k in range(3)]

@@ -166,20 +166,34 @@ def test_what_cannot_be_matched_is_refused():
         ("p.csv", "x,y\n1,two\n", "are no coordinates"),
         ("p.csv", "x,y\n1,nan\n", "are no coordinates"),
         ("p.csv", "x,y\n1,inf\n", "are no coordinates"),
-        ("p.tsv", "x,y\n1,2\n", "has no columns x, y"),
+        ("p.csv", "x,y\n1,2,3\n", "has 3 of 2 columns"),
+        ("p.csv", "x,y\n1_0,2\n", "are no coordinates"),
+        ("p.csv", "x,y\n" + "9" * 400 + ",2\n", "are no coordinates"),
+        ("p.csv", "x,y\n1e300,2\n", "are no coordinates"),
+        ("p.csv", "x;y\n1,5;2.5\n", "are no coordinates"),
+        ("p.csv", "x_mm,y_um\n1,2\n", "has columns in different units"),
+        ("p.csv", "x (inch),y (inch)\n1,2\n", "has no columns x, y"),
+        ("p.csv", 'x,y\n1,"' + "x" * 200_000, "line 2: field larger than field limit"),
+        ("p.csv", '"Pt-0","true","1","2","3","2","3","4"\n', "holds points of two images, as BigWarp writes them"),
+        ("p.txt", "1\t2\t3\n10\t-5\t4\n", "i1 j1 k1 for voxels from 1, as DIR-Lab counts$"),
+        ("p.txt", "1.5 2 3\n", "numbers without titles, so their order and unit are unknown"),
+        ("p.txt", "name x y z\nleft eye 1 2 3\n", "has 5 of 4 columns"),
+        ("p.txt", "point\n" + "9" * 5000 + "\n1 2 3\n", "line 2 the count"),
         ("p.txt", "hello\n", "line 1 must be point or index"),
         ("p.txt", "point\nmany\n1 2 3\n", "line 1 must be point or index"),
         ("p.txt", "point\n2\n1 2 3\n", "announces 2 points"),
-        ("p.txt", "point\n2\n1 2 3\n4 5\n", "announces 2 points"),
+        ("p.txt", "point\n2\n1 2 3\n4 5\n", "has rows of other than 2 or 3 numbers"),
         ("p.txt", "point\n0\n", "holds no points"),
         ("p.fcsv", "# CoordinateSystem = 2\n1,2,3,4,1,1\n", "has coordinate system '2'"),
         ("p.fcsv", "# columns = a,b\n1,2\n", "names no columns x, y, z"),
         ("p.fcsv", "a,1,2\n", "has 3 of 4 columns"),
-        ("p.mrk.json", "{", "no file of markups"),
+        ("p.mrk.json", "{", "is no valid JSON .*; give a file of markups from 3D Slicer"),
+        ("p.mrk.json", '{"markups": [{"controlPoints": [{"position": [' + "1" * 400 + ', 2, 3]}]}]}', "of 400 digits"),
+        ("p.mrk.json", '{"markups": [{"controlPoints": [{"position": [true, 2, 3]}]}]}', "are no coordinates"),
         ("p.mrk.json", "[]", "no file of markups"),
         ("p.mrk.json", '{"markups": [3]}', "no file of markups"),
         ("p.mrk.json", '{"markups": []}', "holds no points"),
-        ("p.mrk.json", json.dumps({"markups": [MARKUP | {"coordinateUnits": "um"}]}), "has its points in um"),
+        ("p.mrk.json", json.dumps({"markups": [MARKUP | {"coordinateUnits": "um"}]}), "has its points in 'um'"),
         ("p.mrk.json", json.dumps({"markups": [MARKUP | {"coordinateSystem": "IJK"}]}), "coordinate system 'IJK'"),
         ("p.mrk.json", '{"markups": [{"controlPoints": [{"position": [1, 2]}]}]}', "without 3 coordinates"),
         ("p.mrk.json", '{"markups": [{"controlPoints": [{"position": [1, 2, null]}]}]}', "are no coordinates"),
@@ -197,7 +211,7 @@ def test_wrong_files_are_one_sentence(tmp_path, name, content, message):
 def test_wrong_places_and_dimensions_are_one_sentence(tmp_path, make_image):
     with pytest.raises(InputError, match="does not exist"):
         read_points(tmp_path / "no.csv")
-    (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00x")
+    (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="is no text"):
         read_points(tmp_path / "binary.csv")
     path = _write(tmp_path, "p.csv", "x,y,z\n1,2,3\n")

@@ -9,8 +9,9 @@ import torch
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.io import gate, itk, read_image, write_image
+from torchdeform.io import gate, read_image, write_image
 from torchdeform.io.images import image_size
+from torchdeform.io.loading import load
 from torchdeform.io.tiff import tiff_size
 
 tifffile = pytest.importorskip("tifffile")
@@ -210,7 +211,7 @@ def test_sizes_are_known_without_the_pixels(tmp_path, shape, how, wanted):
 def test_itk_is_not_given_tiff(tmp_path):
     tifffile.imwrite(tmp_path / "a.mha", values((20, 30)))
     with pytest.raises(InputError, match=r"a.mha is a TIFF"):
-        itk.load(tmp_path / "a.mha")
+        load(tmp_path / "a.mha")
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9, 0.99])

@@ -80,6 +80,14 @@ def test_a_pyramid_in_ome(tmp_path):
     is_the_base(read_image(tmp_path / "a.ome.tif"), base, (0.25e-3,) * 2)
 
 
+def test_labels_of_one_size_are_not_left_out_in_silence(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "a.ome.tif") as file:
+        for name in ("image", "labels"):
+            file.write(tissue(), photometric="rgb", metadata={"axes": "YXS", "Name": name})
+    with pytest.raises(InputError, match="series of 2 images"):
+        read_image(tmp_path / "a.ome.tif")
+
+
 @pytest.mark.parametrize("how", [{"tile": (64, 64)}, {}])
 def test_a_pyramid_of_reduced_pages(tmp_path, how):
     """As GDAL, libvips and ImageMagick write them, with a mask beside."""
@@ -160,7 +168,9 @@ def test_parts_that_are_missing_elsewhere_or_no_files(tmp_path, name):
         if not hasattr(os, "mkfifo"):
             pytest.skip("no pipes here")
         os.mkfifo(tmp_path / name)
-    with pytest.raises(InputError, match=r"does not exist|not beside|device or a pipe"):
+    with pytest.raises(
+        InputError, match=r"a\.ome\.tif is an image in several files: .*(does not exist|not beside|device or a pipe)"
+    ):
         read_image(tmp_path / "a.ome.tif")
     assert image_size(tmp_path / "a.ome.tif") is None
 

@@ -117,3 +117,31 @@ def test_a_link_to_a_file_below_is_followed(tmp_path):
     (tmp_path / "a.raw").symlink_to(tmp_path / "below" / "b.raw")
     (tmp_path / "a.mhd").write_bytes(meta_image(ElementDataFile="a.raw")[: -volume().nbytes])
     np.testing.assert_array_equal(read_image(tmp_path / "a.mhd").data[0, 0], volume())
+
+
+NO_IMAGES = {
+    "a.zip": (b"PK\3\4" + bytes(100), "is a ZIP archive; unpack it"),
+    "a.nii.tar": (bytes(257) + b"ustar" + bytes(250), "is a tar archive; unpack it"),
+    "a.nii.bz2": (b"BZh91AY&SY" + bytes(100), "is packed with bzip2; unpack it"),
+    "a.nii.gz": (b"version https://git-lfs.github.com/spec/v1\n", "is a pointer of git-lfs, not the file; fetch it"),
+    "b.nii.gz": (b"<!DOCTYPE html><html>", "is a web page, not the file; download"),
+    "c.nii.gz": (gzip.compress(b"<html>404</html>"), "is a web page, not the file; download"),
+    "a.pdf": (b"%PDF-1.7", "is a PDF; export"),
+    "a.npy": (b"\x93NUMPY\1\0", "is an array of numpy without a place; write it as"),
+    "a.raw": (bytes(100), r"holds pixels only; put its header \(.mhd, .nhdr or .hdr\) beside it"),
+    "a.img": (bytes(100), "holds pixels only; put its header"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NO_IMAGES)
+def test_what_people_give_instead(tmp_path, name):
+    content, message = NO_IMAGES[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_image(tmp_path / name)
+
+
+def test_pixels_know_their_header(tmp_path):
+    save(volume(), tmp_path / "a.mhd")
+    with pytest.raises(InputError, match=r"a\.raw holds pixels only; give its header, a\.mhd"):
+        read_image(tmp_path / "a.raw")

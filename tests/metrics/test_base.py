@@ -17,7 +17,7 @@ from torchdeform.errors import InputError
 from torchdeform.metrics.correlation import LNCC_FLOOR, ncc
 from torchdeform.metrics.gradients import ngf
 from torchdeform.metrics.information import MutualInformation, mutual_information
-from torchdeform.metrics.similarity import features, make_similarity
+from torchdeform.metrics.similarity import MEASURES, features, make_similarity
 from torchdeform.metrics.squares import ssd
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -274,3 +274,13 @@ def test_the_adjoint_is_that_of_the_derivative():
         total = torch.zeros_like(y)
         add_adjoint_derivative(total, y, grid, axis)
         torch.testing.assert_close((derivative(x, grid, axis) * y).sum(), (x * total).sum())
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("name", MEASURES)
+def test_a_batch_without_an_item_has_no_similarity(name, shape):
+    nothing = torch.rand(0, 2, *shape, requires_grad=True)
+    value = MEASURES[name].function(nothing, nothing, mask=torch.ones(0, 1, *shape))
+    assert value.shape == (0,)
+    value.sum().backward()
+    assert nothing.grad.shape == nothing.shape

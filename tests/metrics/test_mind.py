@@ -124,3 +124,9 @@ def test_a_batch_equals_its_items(shape):
 def test_bad_input_is_named(image, options, message):
     with pytest.raises(InputError, match=message):
         mind_ssc(image, **options)
+
+
+@pytest.mark.parametrize("size", [1e30, 1e-30, 1e-38])
+def test_the_unit_of_the_image_does_not_matter(size):
+    image = torch.rand(2, 1, 9, 10)
+    torch.testing.assert_close(mind_ssc(image * size), mind_ssc(image), rtol=1e-3, atol=1e-3)

@@ -18,9 +18,9 @@ def random(*shape: int) -> torch.Tensor:
 def test_torch_finds_nothing_wrong_with_them(shape):
     dim, spacing = len(shape), SPACING[: len(shape)]
     data, v = random(2, 1 + dim * (dim - 1) // 2, *shape).requires_grad_(), random(2, dim, *shape).requires_grad_()
-    torch.library.opcheck(div_curl_velocity, (data, spacing, WEIGHTS, "slip"))
-    torch.library.opcheck(div_curl_adjoint, (v, spacing, WEIGHTS, "slip"))
-    torch.library.opcheck(share_within_bounds, (v.detach(), spacing, 0.1, 4.0, 2.0))
+    torch.library.opcheck(torch.ops.torchdeform.div_curl_velocity, (data, spacing, WEIGHTS, "slip"))
+    torch.library.opcheck(torch.ops.torchdeform.div_curl_adjoint, (v, spacing, WEIGHTS, "slip"))
+    torch.library.opcheck(torch.ops.torchdeform.share_within_bounds, (v.detach(), spacing, 0.1, 4.0, 2.0))
 
 
 @pytest.mark.parametrize("shape", [(5, 4), (4, 3, 5)])

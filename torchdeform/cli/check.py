@@ -1,19 +1,32 @@
 """``check``: the properties of two images, what looks wrong with them, and a picture of both."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from torchdeform.cli.options import FixedMask, Json, MovingMask, choice, print_json
+from torchdeform.cli.options import (
+    FixedLabels,
+    FixedMask,
+    FixedPoints,
+    Json,
+    MovingLabels,
+    MovingMask,
+    MovingPoints,
+    choice,
+    print_json,
+)
 from torchdeform.core.image import Image, is_oblique, orientation
 from torchdeform.errors import InputError, TorchdeformError, require_choice
 from torchdeform.io import read_image
 from torchdeform.io.files import atomic_folder, suffix
-from torchdeform.io.images import read_optional
+from torchdeform.io.images import read_labels, read_optional
+from torchdeform.io.point_tables import FIXED, MOVING
+from torchdeform.io.points import read_points
+from torchdeform.pipeline.annotations import check_labels, check_points
 from torchdeform.pipeline.config import load_settings
-from torchdeform.pipeline.preflight import ERROR, Finding, preflight
+from torchdeform.pipeline.preflight import ERROR, NOTE, WARNING, Finding, Report, preflight
 from torchdeform.registration.affine.settings import ALIGNMENTS
 from torchdeform.registration.placement import place
 from torchdeform.registration.problem import Annotations
@@ -34,6 +47,10 @@ def check(
     moving: Moving,
     fixed_mask: FixedMask = None,
     moving_mask: MovingMask = None,
+    fixed_points: FixedPoints = None,
+    moving_points: MovingPoints = None,
+    fixed_labels: FixedLabels = None,
+    moving_labels: MovingLabels = None,
     align: Align = "affine",
     out: Picture = None,
     json: Json = False,
@@ -48,12 +65,25 @@ def check(
         raise InputError(f"--out {out}: the picture is a PNG; give a name that ends in .png")
     images = read_image(fixed), read_image(moving)
     masks = read_optional(fixed_mask), read_optional(moving_mask)
-    report = preflight(*images, fixed_mask=masks[0], moving_mask=masks[1], aligned=align != "none")
+    found = preflight(*images, fixed_mask=masks[0], moving_mask=masks[1], aligned=align != "none")
+    more = (
+        *_check_annotations(images[0], FIXED, fixed_points, fixed_labels),
+        *_check_annotations(images[1], MOVING, moving_points, moving_labels),
+    )
+    report = Report(tuple(sorted((*found.findings, *more), key=lambda one: (ERROR, WARNING, NOTE).index(one.severity))))
     predicted = None if report.of(ERROR) else _predicted(*images, *masks, align)
     drawn = _draw(out, *images) if out is not None else None
     (_print_json if json else _print_text)(images, report.findings, predicted, drawn)
     if report.of(ERROR):
         raise typer.Exit(2)
+
+
+def _check_annotations(image: Image, side: str, points: Path | None, labels: Path | None) -> Iterator[Finding]:
+    """Yield what looks wrong with the landmarks and the labels of an image."""
+    if points is not None:
+        yield from check_points(image, read_points(points, image, side=side).positions, points)
+    if labels is not None:
+        yield from check_labels(image, read_labels(labels))
 
 
 def _predicted(

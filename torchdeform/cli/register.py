@@ -10,9 +10,13 @@ import typer
 
 from torchdeform.cli.options import (
     Device,
+    FixedLabels,
     FixedMask,
+    FixedPoints,
     Json,
+    MovingLabels,
     MovingMask,
+    MovingPoints,
     Out,
     Quiet,
     Version,
@@ -20,7 +24,6 @@ from torchdeform.cli.options import (
     flag,
     folds_text,
     inverse_text,
-    optional_file,
     print_json,
     table,
     warn,
@@ -45,10 +48,6 @@ Fixed = Annotated[
     typer.Argument(metavar="FIXED", help="Image that stays: PNG, TIFF, NIfTI, NRRD, a DICOM folder ..."),
 ]
 Moving = Annotated[Path, typer.Argument(metavar="MOVING", help="Image that is warped onto it.")]
-FixedPoints = Annotated[Path | None, optional_file("Landmarks (csv, elastix txt, Slicer), measured ...")]
-MovingPoints = Annotated[Path | None, optional_file("... and the same landmarks in MOVING.")]
-FixedLabels = Annotated[Path | None, optional_file("Regions, whose overlap is measured ...")]
-MovingLabels = Annotated[Path | None, optional_file("... and the same regions of MOVING.")]
 Align = Annotated[str | None, choice(ALIGNMENTS, "First: {} (usual).", "KIND", show_default=False)]
 PointsWeight = Annotated[
     float | None, typer.Option(metavar="W", show_default="0", help="Weight of the landmarks against the similarity.")

@@ -35,6 +35,7 @@ from torchdeform.io.images import (
     write_image,
     write_labels,
 )
+from torchdeform.io.point_tables import FIXED, MOVING
 from torchdeform.io.points import read_points, require_points_file, write_points
 from torchdeform.io.transforms import read_transform, require_transform_file, write_transform
 from torchdeform.pipeline.preflight import looks_like_labels
@@ -52,7 +53,7 @@ TransformFiles = Annotated[
 ]
 MovingFile = Annotated[Path, typer.Argument(metavar="MOVING", help="Image to warp, any format, 2D or 3D.")]
 PointsFile = Annotated[
-    Path, typer.Argument(metavar="POINTS", help="Points: csv, tsv, elastix txt, Slicer fcsv or mrk.json.")
+    Path, typer.Argument(metavar="POINTS", help="Points: csv, tsv, txt, elastix txt, Slicer fcsv or mrk.json.")
 ]
 OutFile = Annotated[Path, typer.Option("--out", metavar="FILE", help="File to write, in the format of its ending.")]
 Reference = Annotated[
@@ -124,7 +125,7 @@ def points(
     require_points_file(out)
     _require_output(out, transform, points, reference)
     chain = _read(transform, inverse)
-    given = read_points(points, read_optional(reference), dim=chain.dim)
+    given = read_points(points, read_optional(reference), dim=chain.dim, side=MOVING if inverse else FIXED)
     write_points(replace(given, positions=chain.points(given.positions)), out)
     say_written(out, quiet=quiet)
 

@@ -213,6 +213,28 @@ def common_batch(where: str, *tensors: Tensor) -> int:
     return sizes.pop()
 
 
+def over_items(function: Callable[[Tensor], Tensor], field: Tensor, dim: int) -> Tensor:
+    """Return function of ``(B, ..)`` for each entry along an axis of ``field``, which comes first in the result."""
+    many = field.movedim(dim, 0)
+    return function(many.flatten(0, 1)).unflatten(0, many.shape[:2])
+
+
+def largest(field: Tensor) -> Tensor:
+    """Return the largest absolute value of each item, ``(B,)``."""
+    return field.detach().abs().flatten(1).amax(1)
+
+
+def magnitude(field: Tensor) -> Tensor:
+    """Return a power of two near the largest absolute value of each item, ``(B, 1, ..)``; 1 if that is 0 or infinite.
+
+    A field divided by it has squares that neither overflow nor vanish, and has lost nothing: the division is exact.
+    """
+    most = largest(field)
+    usable = torch.isfinite(most) & (most > 0)
+    power = torch.ldexp(torch.ones_like(most), torch.frexp(torch.where(usable, most, 1.0)).exponent - 1)
+    return per_item(power, field)
+
+
 def per_item(per_item: Tensor, like: Tensor) -> Tensor:
     """Return ``(B,)`` as ``(B, 1, 1, ..)``, to go with ``like``."""
-    return per_item.view(len(per_item), *([1] * (like.dim() - 1)))
+    return per_item.view(-1, *([1] * (like.dim() - 1)))

@@ -256,8 +256,8 @@ def require_same_place(image: Image, other: Image, *, atol: float = 1e-3) -> Non
     if image.grid.shape != other.grid.shape:
         sizes = f"{image.grid.size_text} and {other.grid.size_text}"
         raise InputError(f"{image.name} and {other.name} must lie on one grid, but have {sizes} nodes; resample one")
-    ends = box_corners(image.grid)
-    apart = (image.to_world(ends) - other.to_world(ends)).norm(dim=1).max()
+    ends, others = (some.to_world(box_corners(some.grid)) for some in (image, other))
+    apart = (ends - others).norm(dim=1).max()
     if float(apart) > atol * min(other.grid.spacing):
         raise InputError(
             f"{image.name} and {other.name} must lie in one place, but their headers put them "

@@ -78,10 +78,10 @@ class Banded:
 
 def _lines(field: Tensor, axis: int) -> Tensor:
     """Return a view ``(n, size, m)`` of a field with ``size`` nodes along the axis."""
-    size = field.shape[axis]
+    before, size, after = math.prod(field.shape[:axis]), field.shape[axis], math.prod(field.shape[axis + 1 :])
     if axis == field.dim() - 1:
-        return field.view(-1, size).T.unsqueeze(0)
-    return field.view(math.prod(field.shape[:axis]), size, -1)
+        return field.view(before, size).T.unsqueeze(0)
+    return field.view(before, size, after)
 
 
 def multiply(field: Tensor, factors: Sequence[Banded | None]) -> Tensor:

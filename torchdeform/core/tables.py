@@ -32,7 +32,7 @@ def kept(most: int) -> Callable[[Callable[_Key, _Table]], Callable[_Key, _Table]
 
         @wraps(make)
         def table(*key: _Key.args, **named: _Key.kwargs) -> _Table:
-            return remembered(*key, **named) if _numbers_are_real() else plain(*key, **named)
+            return remembered(*key, **named) if numbers_are_real() else plain(*key, **named)
 
         return table
 
@@ -40,11 +40,16 @@ def kept(most: int) -> Callable[[Callable[_Key, _Table]], Callable[_Key, _Table]
 
 
 # What torch switches on where tensors go through a mode of Python, and through a transformation of `torch.func`.
-_STAND_INS = (torch._C.DispatchKey.Python, torch._C.DispatchKey.FuncTorchDynamicLayerFrontMode)
+_MODE, _TRANSFORMATION = torch._C.DispatchKey.Python, torch._C.DispatchKey.FuncTorchDynamicLayerFrontMode
 
 
-def _numbers_are_real() -> bool:
+def numbers_are_real() -> bool:
     """Tell whether a tensor made now holds numbers; the public way, to make one and look, takes ten times as long."""
     if torch.compiler.is_compiling():
         return False
-    return not any(torch._C._dispatch_tls_is_dispatch_key_included(key) for key in _STAND_INS)
+    return not (torch._C._dispatch_tls_is_dispatch_key_included(_MODE) or in_transformation())
+
+
+def in_transformation() -> bool:
+    """Tell whether `torch.func` transforms what is computed: grad, jacrev, vmap and their like."""
+    return not torch.compiler.is_compiling() and torch._C._dispatch_tls_is_dispatch_key_included(_TRANSFORMATION)

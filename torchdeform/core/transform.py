@@ -10,7 +10,7 @@ from torchdeform.core.derivatives import jacobian_determinant
 from torchdeform.core.grid import over_slabs, require_float
 from torchdeform.core.image import AUTO, Image, independence, outside_value, overlap
 from torchdeform.core.interpolation import COPYING, LABEL_MODE, interpolator
-from torchdeform.core.warp import invert, sample
+from torchdeform.core.warp import inside_box, invert, sample
 from torchdeform.errors import InputError
 
 # A displacement that moves the faces of its grid further than this, in voxels, is no map of the grid onto itself.
@@ -100,16 +100,15 @@ class Displacement:
     Args:
         field: an image whose ``data`` is u ``(1, D, *S)``: array order, units of spacing; d is u in world axes.
         known_inverse: the field of the inverse map, on any grid, where it is known.
+        margin: how far around its nodes, in voxels, the field goes on with its nearest values; half a voxel in ITK.
 
     Raises:
         InputError: not one displacement, not D components, or an inverse of another dimension.
-
-    Notes:
-        Outside means more than half a voxel outside the grid, as in ITK.
     """
 
     field: Image
     known_inverse: Image | None = None
+    margin: float = 0.5
 
     def __post_init__(self) -> None:
         for image in (self.field, self.known_inverse or self.field):
@@ -127,8 +126,9 @@ class Displacement:
     def __call__(self, points: Tensor) -> Tensor:
         """Return x + d(x) for world points ``(B, D, *T)``, in their type and on their device."""
         where = self.field.to_grid(points.double())
-        u = sample(self.field.data.to(points.device), where, self.field.grid, outside=0.0)
-        return self.field.to_world(where + u).to(points.dtype)
+        u = sample(self.field.data.to(points.device), where, self.field.grid)
+        inside = inside_box(where, self.field.grid, self.margin)
+        return self.field.to_world(where + torch.where(inside, u, 0.0)).to(points.dtype)
 
     def undo(self) -> "tuple[Stage, ...]":
         """Return the stages of the inverse map: the known one, or else one found by Newton's method at every node.
@@ -156,7 +156,7 @@ class Displacement:
 
     def to(self, device: torch.device | str) -> "Displacement":
         """Return the same map with its fields on ``device``."""
-        return Displacement(self.field.to(device), self.known_inverse and self.known_inverse.to(device))
+        return Displacement(self.field.to(device), self.known_inverse and self.known_inverse.to(device), self.margin)
 
 
 def _leak(field: Image) -> float:

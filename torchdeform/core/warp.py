@@ -131,12 +131,15 @@ def _normalise(start: Sequence[Tensor | float], moved: Tensor, grid: Grid) -> Te
     return box
 
 
-def inside_box(points: Tensor, grid: Grid) -> Tensor:
-    """Return ``(B, 1, *T)``, True where the nearest node, were the grid continued, belongs to the grid (as in ITK)."""
+def inside_box(points: Tensor, grid: Grid, margin: float = 0.5) -> Tensor:
+    """Return ``(B, 1, *T)``, True in the box of the nodes and up to ``margin`` voxels around it.
+
+    With half a voxel, as in ITK, the nearest node, were the grid continued, belongs to the grid.
+    """
     inside = torch.ones((), dtype=torch.bool, device=points.device)
     for k, (n, h) in enumerate(zip(grid.shape, grid.spacing, strict=True)):
         index = points[:, k : k + 1] / h
-        inside = inside & (index >= -0.5) & (index < n - 0.5)
+        inside = inside & (index >= -margin) & (index < n - 1 + margin)
     return inside
 
 
@@ -146,6 +149,8 @@ def _sample(image: Tensor, normalised: Tensor, mode: str) -> Tensor:
     items, dim, *shape = normalised.shape
     if 1 not in (items, image.shape[0]) and items != image.shape[0]:
         raise InputError(f"sample: image has {image.shape[0]} batch items but the points have {items}")
+    if normalised.numel() == 0:  # no points, which grid_sample refuses
+        return image.new_zeros(max(items, image.shape[0]), image.shape[1], *shape)
     parts = _parts(image, normalised)
     batch = max(items, image.shape[0]) * parts
     where = normalised.to(image.dtype).reshape(items, dim, parts, -1).permute(0, 2, 3, 1).flatten(0, 1)

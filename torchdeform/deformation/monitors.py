@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.derivatives import divergence, jacobian
-from torchdeform.core.grid import Grid
+from torchdeform.core.grid import Grid, magnitude
 from torchdeform.errors import InputError, require_choice, require_ranges
 from torchdeform.solvers.sine_cosine import inverse_transform, transform
 
@@ -172,7 +172,7 @@ def gradient_monitor(image: Tensor, grid: Grid, settings: MonitorSettings = _DEF
         Does not depend on the unit of I. Differentiable in it.
     """
     _require_image(image, grid, "gradient_monitor: image")
-    slopes = jacobian(smooth(image, grid, settings.smoothing), grid)
+    slopes = jacobian(smooth(image / magnitude(image), grid, settings.smoothing), grid)
     return settings.blend(_share((slopes**2).sum(dim=(1, 2)).unsqueeze(1), grid))
 
 
@@ -197,7 +197,7 @@ def curvature_monitor(image: Tensor, grid: Grid, settings: MonitorSettings = _DE
         As `gradient_monitor`.
     """
     _require_image(image, grid, "curvature_monitor: image")
-    slopes = jacobian(smooth(image, grid, settings.smoothing), grid)
+    slopes = jacobian(smooth(image / magnitude(image), grid, settings.smoothing), grid)
     total = torch.zeros_like(image[:, :1])
     for slope in slopes.unbind(1):
         square = (slope**2).sum(1, keepdim=True)
@@ -239,7 +239,8 @@ def label_monitor(labels: Tensor, factors: Mapping[int, float], grid: Grid, smoo
 
     Args:
         labels: label of each node, ``(B, 1, *S)``, whole numbers of any type.
-        factors: new volume over old volume by label, positive. Labels that are not named share what is left.
+        factors: new volume over old volume by label, positive. Labels that are not named share what is left; where
+            there are none the factors must keep the volume of Ω.
         grid: its grid.
         smoothing: standard deviation of the Gaussian that smooths the borders of regions, units of spacing.
 
@@ -248,7 +249,7 @@ def label_monitor(labels: Tensor, factors: Mapping[int, float], grid: Grid, smoo
 
     Raises:
         InputError: shape, a factor that is not positive and finite, a label that does not occur, or factors that leave
-            the rest of Ω no volume.
+            the rest of Ω no volume or, where labels fill it, do not keep its volume.
 
     Notes:
         Volumes are those of the trapezoidal rule. A smooth border lies half inside the region, half outside.
@@ -262,19 +263,53 @@ def label_monitor(labels: Tensor, factors: Mapping[int, float], grid: Grid, smoo
         if not bool(region.any()):
             raise InputError(f"label_monitor: label {label} does not occur; name labels that the image has")
         taken, f = taken + region, f + factor * region
-    free = mean_value(1 - taken, grid)
-    rest = (1 - mean_value(f, grid)) / free.clamp(min=torch.finfo(values.dtype).tiny)
-    if not bool(((rest > 0) & (free > 0)).all()):
-        raise InputError(
-            "label_monitor: the factors leave the rest of the domain no volume; name fewer labels or lower the factors"
-        )
-    return f + rest * (1 - taken)
+    named = torch.cat([labels == label for label in factors], dim=1)
+    if bool(named.any(dim=1).all()):
+        require_same_volume(named.to(values.dtype), list(factors.values()), grid, "label_monitor")
+        return normalise_monitor(f, grid)
+    free, left = mean_value(1 - taken, grid), 1 - mean_value(f, grid)
+    require_rest(named.logical_not().all(dim=1).flatten(1).any(1), left.flatten(), "label_monitor")
+    return f + left / free * (1 - taken)
 
 
 def require_factors(factors: Mapping[int, float], where: str) -> None:
     """Raise `InputError`, which names ``where``, unless there are factors, all positive and finite."""
     if not factors or not all(0 < factor < math.inf for factor in factors.values()):
         raise InputError(f"{where}: factors must be positive and finite, one or more, got {dict(factors)}")
+
+
+def require_rest(before: Tensor, after: Tensor, where: str) -> None:
+    """Raise `InputError`, which names ``where``, unless what no label names has volume before and after, ``(B,)``."""
+    if not bool((before > 0).all()):
+        item = int((before > 0).logical_not().nonzero()[0, 0])
+        raise InputError(
+            f"{where}: the labels fill item {item} of the batch, so nothing takes up the slack; name fewer"
+        )
+    if not bool((after > 0).all()):
+        raise InputError(
+            f"{where}: the factors leave the rest of the domain no volume; name fewer labels or lower them"
+        )
+
+
+def require_same_volume(inside: Tensor, factors: Sequence[float], grid: Grid, where: str) -> None:
+    """Raise `InputError`, which names ``where``, unless regions that fill Ω keep its volume.
+
+    To 0.1 % of the smallest of them, which could be what the others leave.
+
+    Args:
+        inside: 1 in each region, else 0, ``(B, R, *S)``.
+        factors: new volume over old volume of each.
+        grid: the grid.
+        where: what to name.
+    """
+    shares = mean_value(inside, grid).flatten(1)
+    total = (shares * shares.new_tensor(factors)).sum(1) / shares.sum(1)
+    wrong = (total - 1).abs() > 1e-3 * shares.amin(1)
+    if bool(wrong.any()):
+        raise InputError(
+            f"{where}: the labels fill the domain, and the factors would make its volume {float(total[wrong][0]):.6g} "
+            "times as large; leave out a label, which then takes up the slack, or choose factors that keep the volume"
+        )
 
 
 def smooth(field: Tensor, grid: Grid, sigma: float) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.derivatives import CURL_PAIRS, KERNELS
-from torchdeform.core.grid import Grid
+from torchdeform.core.grid import Grid, magnitude
 from torchdeform.deformation.finite_differences import Differences
 from torchdeform.errors import InputError, require_choice
 from torchdeform.fem.div_curl import DivCurlSolution, solve_div_curl
@@ -102,5 +102,6 @@ def _refine(first: DivCurlSolution, data: Tensor, differences: Differences) -> S
 
 @torch.no_grad()
 def _misfit(u: Tensor, data: Tensor, differences: Differences) -> Tensor:
-    size = differences.norm(data)
-    return torch.where(size > 0, differences.norm(data - differences.rows(u)) / size, 0)
+    scale = magnitude(data)
+    size = differences.norm(data / scale)
+    return torch.where(size > 0, differences.norm((data - differences.rows(u)) / scale) / size, 0)

@@ -13,7 +13,7 @@ from torchdeform.core.diagnostics import smallest_determinant
 from torchdeform.core.flow import OdeSolver, integrate_points
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import sample
-from torchdeform.deformation.monitors import mean_value, require_factors, smooth
+from torchdeform.deformation.monitors import mean_value, require_factors, require_rest, require_same_volume, smooth
 from torchdeform.deformation.versions import grid_from_initial_monitor
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.fem.boundary import fixed_unknowns
@@ -63,7 +63,8 @@ def simulate_volume_change(
 
     Args:
         labels: label of each node, ``(B, 1, *S)``, whole numbers of any type.
-        factors: new volume over old volume by label, positive. Nodes with other labels take up the slack.
+        factors: new volume over old volume by label, positive. Nodes with other labels take up the slack; where there
+            are none the factors must keep the volume of Ω, and the last region gets what the others leave of it.
         grid: the grid.
         rigid_mask: ``(B or 1, 1, *S)``, True at nodes that must not move at all.
         smoothing: standard deviation of the Gaussian that smooths the borders of regions, in units of spacing; by
@@ -77,7 +78,7 @@ def simulate_volume_change(
 
     Raises:
         InputError: shapes, factors, tolerances, a label that does not occur or lies in the rigid mask, or factors that
-            leave the rest no volume.
+            leave the rest no volume or, where labels fill Ω, do not keep its volume.
         ComputationError: the map for a monitor could not be computed, or folds next to the rigid mask.
 
     Notes:
@@ -163,13 +164,14 @@ class _Regions:
         grid.check_scalar(like, "simulate_volume_change: labels")
         self.grid, self.names, self.rigid = grid, list(factors), _checked_mask(rigid, labels, grid)
         self.inside = _indicators(labels, factors, self.rigid).to(like.dtype)
+        wanted = list(factors.values())
+        if not bool(self.inside[:, -1].any()):  # no rest, so the last region is what the others leave
+            require_same_volume(self.inside[:, :-1], wanted, grid, "simulate_volume_change")
+            self.inside, wanted = self.inside[:, :-1], wanted[:-1]
         self.smoothed = _shares(self.inside, grid, smoothing)
         self.before = self._sums(grid.quadrature(dtype=like.dtype, device=like.device))
-        self.wanted = self._with_rest(self.before * like.new_tensor([*factors.values(), 1.0]), self.before.sum(1))
-        if not bool(((self.wanted > 0) & (self.before > 0)).all()):
-            raise InputError(
-                "simulate_volume_change: the factors leave the rest of the domain no volume; name fewer or lower them"
-            )
+        self.wanted = self._with_rest(self.before * like.new_tensor([*wanted, 1.0]), self.before.sum(1))
+        require_rest(self.before[:, -1], self.wanted[:, -1], "simulate_volume_change")
 
     def find_map(self, rtol: float, max_steps: int) -> VolumeChange:
         """Correct the amplitudes until the volumes are right."""
@@ -182,7 +184,7 @@ class _Regions:
             steps += open_
             volumes = self._sums(nodal_volumes(u, self.grid))
             wanted = self._with_rest(self.wanted, volumes.sum(1))
-            off = (volumes / wanted - 1)[:, :-1].abs().amax(1)
+            off = (volumes / wanted - 1)[:, : len(self.names)].abs().amax(1)
             open_ = off > rtol
             if not bool((open_ & (steps < max_steps)).any()):
                 return self._report(u, volumes, off, steps, open_)
@@ -249,6 +251,8 @@ def _shares(inside: Tensor, grid: Grid, smoothing: float) -> Tensor:
     A smoothed region is widened before it counts as a share, so that J is even up to the rim of a region and falls off
     outside, in the rest of Ω; regions that touch share the nodes between them.
     """
+    if inside.shape[1] == 1:
+        return torch.ones_like(inside)
     labelled = (_WIDENING * smooth(inside[:, :-1], grid, smoothing)).clamp(max=1)
     most = torch.where(inside[:, -1:] > 0, _MOST_OF_REST, inside.new_ones(()))
     total = labelled.sum(dim=1, keepdim=True)

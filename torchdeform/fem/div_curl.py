@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.derivatives import CURL_PAIRS
-from torchdeform.core.grid import Grid, common_batch, per_item
+from torchdeform.core.grid import Grid, common_batch, magnitude, per_item
 from torchdeform.errors import InputError
 from torchdeform.fem.boundary import Boundary, normal_is_given, outward_flux
 from torchdeform.fem.fast_transform import solve_poisson
@@ -15,7 +15,7 @@ from torchdeform.fem.operator import assemble_load
 from torchdeform.fem.solver import SolverSettings, solver_of
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
-from torchdeform.solvers.base import Solution, Status
+from torchdeform.solvers.base import Solution, Status, listed
 from torchdeform.solvers.cg import DEFAULT_RTOL
 
 
@@ -156,6 +156,10 @@ def _allow_rounding(system: DivCurlSystem, load: Tensor, found: Solution) -> tup
     """Call an item solved whose residual is what rounding v leaves, 8 ε ‖diag(K) v‖ (up to 5 ε is seen)."""
     if Status.ROUNDING not in found.status:
         return found.status
-    floor = 8 * torch.finfo(load.dtype).eps * (system.diagonal(load) * found.value).flatten(1).norm(dim=1)
-    fine = (found.residual * system.free(load).flatten(1).norm(dim=1) <= floor).tolist()
-    return tuple(Status.CONVERGED if s is Status.ROUNDING and f else s for s, f in zip(found.status, fine, strict=True))
+    free = system.free(load)
+    scale = magnitude(free)
+    floor = 8 * torch.finfo(load.dtype).eps * (system.diagonal(load) * (found.value / scale)).flatten(1).norm(dim=1)
+    left = listed((found.residual * (free / scale).flatten(1).norm(dim=1) > floor).long())
+    return tuple(
+        Status.CONVERGED if s is Status.ROUNDING and not f else s for s, f in zip(found.status, left, strict=True)
+    )

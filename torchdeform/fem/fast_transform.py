@@ -25,12 +25,13 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from torchdeform.core.grid import Grid
+from torchdeform.core.grid import Grid, largest, magnitude
+from torchdeform.core.tables import numbers_are_real
 from torchdeform.errors import InputError
 from torchdeform.fem.boundary import Boundary, Face, fixes, resolve_boundary
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
-from torchdeform.solvers.base import Factor, Solution, Status
+from torchdeform.solvers.base import Factor, Solution, Status, listed
 from torchdeform.solvers.cg import DEFAULT_RTOL
 from torchdeform.solvers.sine_cosine import Kind, Kinds, separable_transform
 
@@ -113,19 +114,24 @@ class TransformFactor(Factor):
 
     def solution(self, load: Tensor) -> Solution:
         """Return v, with the residual that rounding leaves."""
-        value = self(load)
+        free = self.system.free(load)
+        scale = magnitude(free)
+        free = free / scale
+        value = self(free)
         with torch.no_grad():
-            free = self.system.free(load)
             norm, left = (t.flatten(1).norm(dim=1) for t in (free, free - self.system.apply(value)))
-        met, finite = left <= torch.clamp(self.rtol * norm, min=self.atol), torch.isfinite(left)
-        codes = torch.where(finite, met.long(), 2)
-        status = tuple((Status.ROUNDING, Status.CONVERGED, Status.NON_FINITE)[code] for code in codes.tolist())
+        value = value * scale
+        met = left <= torch.maximum(self.rtol * norm, self.atol / scale.flatten())
+        finite = torch.isfinite(left) & torch.isfinite(largest(value))
+        codes = torch.where(finite, (~met).long(), 2)
+        status = tuple((Status.CONVERGED, Status.ROUNDING, Status.NON_FINITE)[code] for code in listed(codes))
         steps = torch.zeros(load.shape[0], dtype=torch.int64, device=load.device)
-        return Solution(value, status, steps, torch.where(norm > 0, left / norm, 0))
+        residual = torch.where(norm > 0, left / norm, 0)
+        return Solution(value, status, steps, torch.where(finite, residual, torch.nan))
 
     def _buffer(self, load: Tensor) -> Tensor | None:
         """Memory for the modes, kept as new pages cost a fifth of a solve; None where autograd holds on to them."""
-        if torch.is_grad_enabled() and (load.requires_grad or self._needs_grad):
+        if not numbers_are_real() or (torch.is_grad_enabled() and (load.requires_grad or self._needs_grad)):
             return None
         if self._workspace.shape != load.shape:
             with torch.inference_mode(False):
@@ -266,6 +272,6 @@ def _held(divisor: Tensor, weights: Weights, symbols: list[_Symbols]) -> Tensor:
 
 def _scale(modes: Tensor, factor: Tensor) -> Tensor:
     """Return modes · factor, in the memory of ``modes`` where it fits and autograd does not need it any more."""
-    if factor.requires_grad or factor.shape[0] > modes.shape[0]:
+    if not numbers_are_real() or factor.requires_grad or factor.shape[0] > modes.shape[0]:
         return modes * factor
     return modes.mul_(factor)

@@ -11,7 +11,7 @@ from functools import lru_cache
 from torch import Tensor
 from torch.autograd import Function
 
-from torchdeform.core.grid import Grid
+from torchdeform.core.grid import Grid, over_items
 from torchdeform.fem.elements import INTERVAL, Matrix
 
 # Per axis: is the test function differentiated, is the trial function?
@@ -45,17 +45,30 @@ def apply_products(products: tuple[Product, ...], x: Tensor, grid: Grid, outputs
 
 class _Apply(Function):
     @staticmethod
-    def forward(ctx, x: Tensor, products: tuple[Product, ...], grid: Grid, outputs: int) -> Tensor:
-        ctx.products, ctx.grid, ctx.inputs = products, grid, x.shape[1]
+    def forward(x: Tensor, products: tuple[Product, ...], grid: Grid, outputs: int) -> Tensor:
         out = x.new_zeros(x.shape[0], outputs, *grid.shape)
         for (target, source, face_axis), terms in _plan(products, grid.spacing).items():
             _add(out[:, target], terms, x[:, source], face_axis)
         return out
 
     @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        x, *ctx.settings = inputs
+        ctx.inputs = x.shape[1]
+
+    @staticmethod
+    def jvp(ctx, tangent: Tensor, *_: None) -> Tensor:
+        return _Apply.apply(tangent, *ctx.settings)
+
+    @staticmethod
+    def vmap(info, in_dims, x: Tensor, products: tuple[Product, ...], grid: Grid, outputs: int):
+        return over_items(lambda items: _Apply.apply(items, products, grid, outputs), x, in_dims[0]), 0
+
+    @staticmethod
     def backward(ctx, *grads: Tensor):
-        transposed = tuple((c, j, i, tuple((b, a) for a, b in factors)) for c, i, j, factors in ctx.products)
-        return apply_products(transposed, grads[0], ctx.grid, ctx.inputs), None, None, None
+        products, grid, _ = ctx.settings
+        transposed = tuple((c, j, i, tuple((b, a) for a, b in factors)) for c, i, j, factors in products)
+        return apply_products(transposed, grads[0], grid, ctx.inputs), None, None, None
 
 
 @lru_cache(maxsize=256)

@@ -67,6 +67,15 @@ def size(path: Path) -> tuple[tuple[int, int, int], int]:
     return (len(found), rows, columns), channels
 
 
+def files(path: Path) -> list[Path]:
+    """Return the files that `read_file` reads for a file, sorted.
+
+    Raises:
+        InputError: as it does, except for pixels.
+    """
+    return sorted({found.path for found in _of_file(path)})
+
+
 def _of_file(path: Path) -> list[Slice]:
     """Return the slices that are read for a file, sorted."""
     here = slices(path)

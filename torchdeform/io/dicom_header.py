@@ -2,29 +2,29 @@
 
 import math
 import re
-import warnings
 import zlib
-from collections.abc import Callable, Iterator, Mapping, MutableSequence, Sequence
+from collections.abc import Iterator, Mapping, MutableSequence, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchdeform.errors import InputError
 from torchdeform.io.files import read_head
-from torchdeform.io.gate import DAMAGED, require_room
+from torchdeform.io.gate import DAMAGED, reading, require_room
+from torchdeform.io.isolated import isolated
 
 if TYPE_CHECKING:
     from pydicom import Dataset
 
-_Result = TypeVar("_Result")
-
 # Files without the preamble start with an element of group 2 or 8: its number, then a VR or a short length.
 # Files without the preamble start with an element of group 2 or 8: its number, then a VR or a short length.
 _MAGIC = 128, b"DICM"
-_BARE = re.compile(rb"[\x02\x08]\0[\0-\x3f]\0(AE|CS|DA|DT|IS|LO|OB|PN|SH|SQ|TM|UI|UL|US|[\0-\x40]\0\0\0)", re.DOTALL)
+_BARE = re.compile(rb"[\x02\x08]\0(..(AE|CS|DA|DT|IS|LO|OB|PN|SH|SQ|TM|UI|UL|US)|[\0-\x3f]\0[\0-\x40]\0{3})", re.DOTALL)
+_LIKE = (b"DICM", b"\x02\0", b"\x08\0")
+_GIPL = (b"\xef\xff\xe9\xb0", b"\x2a\xe3\x89\xb8")  # a format of volumes whose width may look like that
 _META = 144  # where the first elements begin, after the length of them
 
 # Kinds of DICOM files without an image: directories, presentation states, reports, documents, plans, raw data.
@@ -37,6 +37,8 @@ _SLIDE = "1.2.840.10008.5.1.4.1.1.77.1.6"
 _DEFLATED = b"1.2.840.10008.1.2.1.99"
 _VIDEO = ("1.2.840.10008.1.2.4.10", "1.2.840.10008.1.2.7.")  # how their transfer syntaxes start
 _CHUNK = 1 << 20  # bytes unpacked at once
+
+SECONDS = 8.0  # that a file may take, beside what its length adds
 
 DCM2NIIX = "convert it with `dcm2niix` and give one volume of the result"
 
@@ -148,34 +150,34 @@ def is_dicom(path: Path) -> bool:
     return head[start:] == magic or _BARE.match(head) is not None
 
 
+def may_be_dicom(path: Path) -> bool:
+    """Return whether a file is DICOM, or so like it that ITK would look for DICOM in it, by GDCM, which may crash."""
+    head = read_head(path, 256)
+    return is_dicom(path) or (head.startswith(_LIKE) and head[252:] not in _GIPL)
+
+
 def slices(path: Path) -> list[Slice]:
     """Return the slices of a DICOM file in the order of the file; none if it holds no image.
 
     Raises:
         InputError: a damaged header; frames that are no volume: a cine, a mosaic, a slide.
+
+    Notes:
+        Read in a process of its own, since some headers of a few kilobytes keep pydicom busy for minutes.
     """
-    return guarded(path, lambda: _slices(path, read(path, [*_KEYWORDS, *_PASSES, _GROUPS])))
+    return isolated(_slices, path, path=path, seconds=SECONDS)
 
 
 def no_image(path: Path) -> str:
     """Return the sentence for a DICOM file without an image."""
-    kind = guarded(path, lambda: str(read(path, ["SOPClassUID"]).get("SOPClassUID", "")))
+    kind = isolated(_kind, path, path=path, seconds=SECONDS)
     what = _ADVICE.get(kind, "no DICOM image; give an image file, or the folder of the series")
     return f"{path} holds {what}"
 
 
-def guarded(path: Path, work: Callable[[], _Result]) -> _Result:
-    """Return what ``work`` makes of a DICOM file; whatever its content provokes is an `InputError`."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about values that break the standard but can be read
-        try:
-            return work()
-        except InputError:
-            raise
-        except Exception as error:  # pydicom raises errors of a dozen types
-            if isinstance(error, OSError) and error.errno is not None:  # the machine's, not pydicom's
-                raise
-            raise InputError(f"{path} {DAMAGED}") from error
+def _kind(path: Path) -> str:
+    with reading(path):
+        return str(read(path, ["SOPClassUID"]).get("SOPClassUID", ""))
 
 
 def read(path: Path, keywords: Sequence[str] = ()) -> "Dataset":
@@ -243,7 +245,12 @@ class _Frame:
         return tuple((name, str(self.find(*places))) for name, places in table.items())
 
 
-def _slices(path: Path, header: "Dataset") -> list[Slice]:
+def _slices(path: Path) -> list[Slice]:
+    with reading(path):
+        return _of_header(path, read(path, [*_KEYWORDS, *_PASSES, _GROUPS]))
+
+
+def _of_header(path: Path, header: "Dataset") -> list[Slice]:
     if _NO_IMAGE.match(str(header.get("SOPClassUID", ""))) or "Rows" not in header:
         return []
     size = int(header.Rows), int(header.Columns), int(header.get("SamplesPerPixel") or 1)

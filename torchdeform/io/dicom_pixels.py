@@ -1,4 +1,4 @@
-"""Pixels of DICOM: stored values by pydicom; what is compressed is unpacked by GDCM in a process of its own."""
+"""Pixels of DICOM, in a process of its own: stored values by pydicom, what is compressed is unpacked by GDCM."""
 
 import math
 import tempfile
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchdeform.errors import InputError
-from torchdeform.io.dicom_header import guarded, packing, read
+from torchdeform.io.dicom_header import SECONDS, packing, read
 from torchdeform.io.files import native_stderr
-from torchdeform.io.gate import DAMAGED, require_room
+from torchdeform.io.gate import DAMAGED, reading, require_room
 from torchdeform.io.isolated import isolated
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 # What describes pixels and nothing else.
 _MODULE = [
-    "SamplesPerPixel", "PhotometricInterpretation", "PlanarConfiguration", "NumberOfFrames", "Rows", "Columns",
+    "SamplesPerPixel", "PlanarConfiguration", "NumberOfFrames", "Rows", "Columns",
     "BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation", "PixelData",
 ]  # fmt: skip
 _SAMPLES = ("PixelData", "FloatPixelData", "DoubleFloatPixelData")
@@ -35,7 +35,12 @@ def pixels(path: Path) -> NDArray[np.generic]:
     Notes:
         Palettes and other colours become RGB; where white is zero (MONOCHROME1) values are turned around.
     """
-    return guarded(path, lambda: _shown(path, read(path)))
+    return isolated(_pixels, path, path=path, seconds=SECONDS)
+
+
+def _pixels(path: Path) -> NDArray[np.generic]:
+    with reading(path):
+        return _shown(path, read(path))
 
 
 def _shown(path: Path, header: "Dataset") -> NDArray[np.generic]:
@@ -76,7 +81,7 @@ def _numbers(header: "Dataset") -> int:
 
 def _unpacked(path: Path, header: "Dataset") -> NDArray[np.generic]:
     require_room(path, _numbers(header) * math.ceil(int(header.BitsAllocated) / 8))
-    found = isolated(_by_gdcm, path, path=path)
+    found = _by_gdcm(header)
     if found is None or found.size != _numbers(header):
         _, name = packing(header)
         raise InputError(
@@ -86,13 +91,12 @@ def _unpacked(path: Path, header: "Dataset") -> NDArray[np.generic]:
     return found
 
 
-def _by_gdcm(path: Path) -> NDArray[np.generic] | None:
-    """Unpack the pixels of a file, None if that fails. GDCM sees a file of the pixels alone, so no other content."""
+def _by_gdcm(header: "Dataset") -> NDArray[np.generic] | None:
+    """Unpack pixels, None if that fails. GDCM sees a file of the pixels alone, so no other content."""
     import SimpleITK as sitk
 
     with tempfile.TemporaryDirectory() as folder:
-        alone = Path(folder) / "pixels.dcm"
-        guarded(path, lambda: _write_pixels(read(path), alone))
+        _write_pixels(header, alone := Path(folder) / "pixels.dcm")
         reader = sitk.ImageFileReader()
         reader.SetImageIO("GDCMImageIO")
         reader.SetFileName(str(alone))
@@ -112,8 +116,8 @@ def _write_pixels(header: "Dataset", path: Path) -> None:
     for keyword in _MODULE:
         if keyword in header:
             alone[keyword] = header[keyword]
-    if int(header.get("SamplesPerPixel") or 1) == 1:
-        alone.PhotometricInterpretation = "MONOCHROME2"
+    grey = int(header.get("SamplesPerPixel") or 1) == 1
+    alone.PhotometricInterpretation = "MONOCHROME2" if grey else header.PhotometricInterpretation
     alone.file_meta = FileMetaDataset()
     alone.file_meta.TransferSyntaxUID = header.file_meta.TransferSyntaxUID
     alone.SOPClassUID = alone.file_meta.MediaStorageSOPClassUID = SecondaryCaptureImageStorage

@@ -11,11 +11,13 @@ import numpy as np
 
 from torchdeform.errors import InputError
 from torchdeform.io.gate import DAMAGED, require_beside, require_room
+from torchdeform.io.packed import MAGIC
 
 LONGEST = 1 << 20  # bytes of a header that are read
 CUT_OFF = "has a header that is cut off; fetch or export it again"
 
-_CHUNK = 1 << 22  # bytes read or unpacked at once
+_CHUNK, _PACKED = 1 << 22, 1 << 18  # bytes unpacked and read at once
+_ANY_HEADER = zlib.MAX_WBITS | 32  # of gzip or zlib
 _MOST_AXES, _MOST_FILES = 5, 100_000
 _COUNT = re.compile(r"[0-9]{1,15}")
 _SKIP = re.compile(r"-?[0-9]{1,15}")
@@ -90,45 +92,59 @@ class Header:
 
 def _unpacked_length(path: Path, start: int, packing: str, needed: int) -> int:
     """Return how many bytes a packed file holds up to where it breaks off; counting stops at ``needed``."""
-    unpacker, length, rest = bz2.BZ2Decompressor() if packing == "bzip2" else _Inflater(), 0, True
+    unpacker, length = bz2.BZ2Decompressor() if packing == "bzip2" else _Inflater(), 0
     with path.open("rb") as file:
         file.seek(start)
         try:
-            while rest and length < needed and not unpacker.eof:
-                rest = file.read(_CHUNK) if unpacker.needs_input else b""
-                length += len(unpacker.decompress(rest, _CHUNK))
-                rest = rest or not unpacker.needs_input
+            while length < needed and not unpacker.eof:
+                packed = file.read(_PACKED) if unpacker.needs_input else b""
+                found = len(unpacker.decompress(packed, _CHUNK))
+                if not (packed or found) and unpacker.needs_input:
+                    break
+                length += found
         except (zlib.error, OSError):
             pass
     return length
 
 
 class _Inflater:
-    """What unpacks gzip and zlib, with the interface of what unpacks bzip2: it gives no more than it is asked for."""
+    """What unpacks gzip (also several in a row) and zlib, with the interface of what unpacks bzip2.
+
+    It gives no more at once than it is asked for.
+    """
 
     def __init__(self) -> None:
-        self._unpacker = zlib.decompressobj(zlib.MAX_WBITS | 32)
+        self._unpacker = zlib.decompressobj(_ANY_HEADER)
 
     @property
     def eof(self) -> bool:
-        return self._unpacker.eof
+        return self._unpacker.eof and not self._unpacker.unused_data.startswith(MAGIC)
 
     @property
     def needs_input(self) -> bool:
-        return not self._unpacker.unconsumed_tail
+        return not self._held
 
     def decompress(self, data: bytes, most: int) -> bytes:
-        return self._unpacker.decompress(self._unpacker.unconsumed_tail + data, most)
+        held = self._held + data
+        if self._unpacker.eof:
+            self._unpacker = zlib.decompressobj(_ANY_HEADER)
+        return self._unpacker.decompress(held, most)
+
+    @property
+    def _held(self) -> bytes:
+        return self._unpacker.unconsumed_tail or self._unpacker.unused_data
 
 
 def sizes(path: Path, text: str, rank: str) -> tuple[int, ...]:
     """Return the sizes of the axes; `InputError` unless they are as many positive whole numbers as ``rank`` says."""
+    if rank and not rank.isdecimal():
+        raise InputError(f"{path} has the number of axes '{rank[:80]}' in its header; correct the header")
     found = text.split()
     positive = all(_COUNT.fullmatch(size) and int(size) > 0 for size in found)
     if not positive or not 1 <= len(found) <= _MOST_AXES or (rank and rank != str(len(found))):
-        count = rank if rank.isdecimal() else "1 to 5"
         raise InputError(
-            f"{path} has the size '{text[:80]}' in its header, not {count} positive whole numbers; correct the header"
+            f"{path} has the size '{text[:80]}' in its header, not {rank or '1 to 5'} positive whole numbers; "
+            "correct the header"
         )
     return tuple(map(int, found))
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import dicom, itk
+from torchdeform.io.dicom_header import may_be_dicom
 from torchdeform.io.files import atomic_folder, is_tiff, suffix
 from torchdeform.io.gate import require_file
 from torchdeform.io.kinds import GZIP, kind_of
@@ -83,10 +84,10 @@ def _read(file: Path, *, exact: bool = False) -> Image:
     if file.is_dir():
         return dicom.read_folder(file)
     require_file(file, "image file")
-    if dicom.is_dicom(file):
+    if may_be_dicom(file):
         return dicom.read_file(file)
     if is_tiff(file):
-        return read_tiff(file)
+        return read_tiff(file, exact=exact)
     if is_picture(file):
         return read_picture(file)
     if kind_of(file) == GZIP:
@@ -203,7 +204,7 @@ def image_size(path: Path) -> tuple[tuple[int, ...], int] | None:
 
 
 def _size(path: Path) -> tuple[tuple[int, ...], int] | None:
-    if path.is_dir() or dicom.is_dicom(path):
+    if path.is_dir() or may_be_dicom(path):
         return dicom.size(path)
     if is_tiff(path):
         return tiff_size(path)
@@ -214,7 +215,7 @@ def _size(path: Path) -> tuple[tuple[int, ...], int] | None:
 
 
 def read_labels(path: str | os.PathLike[str]) -> Image:
-    """Read a label image: like `read_image`, but volumes in float64 if float32 would merge labels above 2²⁴.
+    """Read a label image: like `read_image`, but in float64 if float32 would merge labels above 2²⁴.
 
     Args:
         path: the file, any format that `read_image` reads.

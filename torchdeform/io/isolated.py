@@ -37,7 +37,7 @@ def isolated(
         The process starts with the first call (0.3 s), is kept for the next, and ends with this one. It gets no more
         memory than is free.
     """
-    seconds = (_SECONDS if seconds is None else seconds) + _PER_BYTE * (path.stat().st_size if size is None else size)
+    seconds = (seconds or _SECONDS) + _PER_BYTE * (path.stat().st_size if size is None else size)
     try:
         return _worker(os.getpid()).call(_limited, Path.cwd(), available(), function, arguments, timeout=seconds)
     except WorkerLost as error:

@@ -12,19 +12,12 @@ from torch import Tensor
 from torchdeform.core.grid import Grid, slabs
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.io import loading
 from torchdeform.io.files import atomic_folder, native_stderr
-from torchdeform.io.loading import load as load
-from torchdeform.io.loading import no_warnings
-from torchdeform.io.loading import quietly as quietly
-from torchdeform.io.loading import reason as reason
-from torchdeform.io.volume import Volume, squared
+from torchdeform.io.loading import no_warnings, reason, volume_of
+from torchdeform.io.volume import Volume, held_type, squared
 
 if TYPE_CHECKING:
     import SimpleITK as sitk
-
-# Types whose values float32, in which images are read, cannot all represent.
-_WIDE = ("int32", "uint32", "int64", "uint64", "float64")
 
 
 def save(image: "sitk.Image", path: Path) -> None:
@@ -45,7 +38,7 @@ def save(image: "sitk.Image", path: Path) -> None:
 
 def to_image(itk: "sitk.Image", name: str) -> Image:
     """Return a SimpleITK image as `volume_image` does."""
-    return volume_image(loading.volume_of(itk), name)
+    return volume_image(volume_of(itk), name)
 
 
 def volume_image(volume: Volume, name: str, *, exact: bool = False) -> Image:
@@ -68,7 +61,7 @@ def volume_image(volume: Volume, name: str, *, exact: bool = False) -> Image:
     shape = tuple(n for n in volume.size[::-1] if n > 1)
     if len(shape) < 2:
         raise InputError(f"{name} has size {list(volume.size)}; give an image with at least two axes")
-    kind = np.float64 if exact and values.dtype.name in _WIDE else np.float32
+    kind = held_type(values.dtype, exact=exact)
     with np.errstate(over="ignore"):
         data = torch.from_numpy(np.ascontiguousarray(values, dtype=kind).reshape(1, *shape, values.shape[-1]))
     grid = Grid(shape, tuple(reversed(spacing)))

@@ -12,6 +12,22 @@ from torchdeform.io.packed import is_packed
 NIFTI, ANALYZE, MGH, META, NRRD, GZIP, UNKNOWN = "nifti", "analyze", "mgh", "meta", "nrrd", "gzip", ""
 
 _HEAD = 4096  # bytes that tell the kind
+# What people download or give instead of an image: start and position of its magic bytes, what it is, what to do.
+_NO_IMAGES = (
+    (b"PK\3\4", 0, "a ZIP archive", "unpack it and give the image that it holds"),
+    (b"ustar", 257, "a tar archive", "unpack it and give the image that it holds"),
+    (b"7z\xbc\xaf", 0, "a 7z archive", "unpack it and give the image that it holds"),
+    (b"BZh", 0, "packed with bzip2", "unpack it and give the image that it holds"),
+    (b"\xfd7zXZ", 0, "packed with xz", "unpack it and give the image that it holds"),
+    (b"\x28\xb5\x2f\xfd", 0, "packed with zstd", "unpack it and give the image that it holds"),
+    (b"version https://git-lfs", 0, "a pointer of git-lfs, not the file", "fetch it with git lfs pull"),
+    (b"/annex/", 0, "a pointer of git-annex, not the file", "fetch it with git annex get"),
+    (b"<!doctype html", 0, "a web page, not the file", "download the file itself"),
+    (b"<html", 0, "a web page, not the file", "download the file itself"),
+    (b"%pdf", 0, "a PDF", "export its picture as PNG or TIFF"),
+    (b"\x93numpy", 0, "an array of numpy without a place", "write it as NIfTI or TIFF"),
+)
+
 _META = re.compile(rb"^\s*(ObjectType|NDims)\s*[=:]", re.MULTILINE)
 _MGH_TYPES = (0, 1, 3, 4)
 
@@ -26,6 +42,15 @@ def kind_of(path: Path) -> str:
         return _kind(read_head(path, _HEAD))
     inner = _kind(_unpacked_head(path))
     return inner if inner in (NIFTI, MGH) else GZIP
+
+
+def known_otherwise(path: Path) -> str:
+    """Return what a file is that is certainly no image, and what to do, as the rest of a sentence; else nothing."""
+    head = read_head(path, _HEAD).lower()
+    for magic, start, name, remedy in _NO_IMAGES:
+        if head[start:].startswith(magic.lower()):
+            return f"is {name}; {remedy}"
+    return ""
 
 
 def _unpacked_head(path: Path) -> bytes:

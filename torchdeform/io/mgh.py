@@ -48,4 +48,4 @@ def read_mgh(path: Path) -> Volume:
     if values.dtype.kind == "f" and not np.isfinite(values).all():
         raise InputError(f"{path} {NOT_FINITE}")
     values = values.reshape(values.shape[:3]).T[..., None]
-    return place(values.astype(values.dtype.newbyteorder("="), copy=False), image.affine[:3], path)
+    return place(values.astype(values.dtype.newbyteorder("="), copy=False), np.asarray(image.affine)[:3], path)

@@ -12,7 +12,7 @@ from torchdeform.errors import InputError
 from torchdeform.io.files import suffix
 from torchdeform.io.gate import DAMAGED, require_beside, require_room
 from torchdeform.io.packed import Stream, opened
-from torchdeform.io.volume import NOT_FINITE, Volume, require_one
+from torchdeform.io.volume import NOT_FINITE, Volume, is_stack, require_one
 
 _CHUNK = 1 << 22  # bytes read at once
 _LONGEST_TAIL = 64_000_000  # bytes behind the pixels that are read, for the checksum at the end of a packed file
@@ -20,14 +20,14 @@ _LONGEST_TAIL = 64_000_000  # bytes behind the pixels that are read, for the che
 # Name, type and position of fields of the header, by the number that it starts with, which is its length.
 _FIELDS = {
     348: (
-        ("dim", "8i2", 40), ("datatype", "i2", 70), ("pixdim", "8f4", 76), ("offset", "f4", 108), ("slope", "f4", 112),
-        ("inter", "f4", 116), ("units", "u1", 123), ("qform", "i2", 252), ("sform", "i2", 254), ("quatern", "3f4", 256),
-        ("qoffset", "3f4", 268), ("rows", "(3,4)f4", 280), ("magic", "S4", 344),
+        ("dim", "8i2", 40), ("intent", "i2", 68), ("datatype", "i2", 70), ("pixdim", "8f4", 76), ("offset", "f4", 108),
+        ("slope", "f4", 112), ("inter", "f4", 116), ("units", "u1", 123), ("qform", "i2", 252), ("sform", "i2", 254),
+        ("quatern", "3f4", 256), ("qoffset", "3f4", 268), ("rows", "(3,4)f4", 280), ("magic", "S4", 344),
     ),
     540: (
         ("magic", "S4", 4), ("datatype", "i2", 12), ("dim", "8i8", 16), ("pixdim", "8f8", 104), ("offset", "i8", 168),
         ("slope", "f8", 176), ("inter", "f8", 184), ("qform", "i4", 344), ("sform", "i4", 348), ("quatern", "3f8", 352),
-        ("qoffset", "3f8", 376), ("rows", "(3,4)f8", 400), ("units", "i4", 500),
+        ("qoffset", "3f8", 376), ("rows", "(3,4)f8", 400), ("units", "i4", 500), ("intent", "i4", 504),
     ),
 }  # fmt: skip
 
@@ -43,6 +43,7 @@ _UNITS = {1: (1e3, "mm"), 3: (1e-3, "µm")}
 
 _LPS = np.array([[-1.0], [-1.0], [1.0]])  # signs that take RAS, NIfTI's world, to LPS
 
+_SINGULAR = 1e-6  # volume of the cell of three unit vectors that lie in a plane
 _ROUNDED = 5e-3  # share by which two lengths of a header may differ that are the same but for rounding
 _NO_ROTATION = 1.01  # squared length of a quaternion's last three numbers that rounding does not explain
 _APART = 0.25  # of a voxel, by which qform and sform may differ in silence
@@ -50,11 +51,12 @@ _APART = 0.25  # of a voxel, by which qform and sform may differ in silence
 
 @dataclass(frozen=True)
 class _Header:
-    """The fields of a header by name, and the file of the pixels."""
+    """The fields of a header by name, the file of the pixels, and whether a fourth axis may hold vectors."""
 
     path: Path
     data: Path
     fields: Any
+    vectors: bool = False
 
     @property
     def size(self) -> tuple[int, ...]:
@@ -66,9 +68,15 @@ class _Header:
         return tuple(kept)
 
     @property
+    def stacked(self) -> bool:
+        """Whether the fourth axis holds the numbers of a pixel."""
+        return self.vectors and is_stack(self.size)
+
+    @property
     def vector(self) -> int:
-        """Numbers of a pixel on the fifth axis."""
-        return self.size[4] if len(self.size) == 5 and self.size[3] == 1 else 1
+        """Numbers of a pixel on the fifth axis, or on the fourth."""
+        fifth = self.size[4] if len(self.size) == 5 and self.size[3] == 1 else 1
+        return self.size[3] if self.stacked else fifth
 
     @property
     def space(self) -> tuple[int, ...]:
@@ -110,11 +118,12 @@ def nifti_files(path: Path) -> tuple[Path, ...]:
     return () if header.data == path else (header.data,)
 
 
-def read_nifti(path: Path) -> Volume:
+def read_nifti(path: Path, *, vectors: bool = False) -> Volume:
     """Read a NIfTI file.
 
     Args:
         path: the file, or the header of a pair.
+        vectors: whether a fourth axis that can hold vectors does.
 
     Raises:
         InputError: damaged, a series, complex numbers, pixels that are NaN or infinite, or a header without sense.
@@ -124,7 +133,7 @@ def read_nifti(path: Path) -> Volume:
         disagree. Without either it starts at 0 along the world's axes, as in ITK.
         Lengths become mm by the unit of the file; pixels are scaled as the header says.
     """
-    header = _read_header(path)
+    header = replace(_read_header(path), vectors=vectors)
     require_one(path, header.space)
     with opened(header.data, path) as file:
         values = _scaled(_pixels(file, header), header)
@@ -132,7 +141,8 @@ def read_nifti(path: Path) -> Volume:
         raise InputError(f"{path} {NOT_FINITE}")
     rows, remarks = _rows(header)
     volume = place(values, rows, path)
-    volume = _with_pixdim(replace(volume, remarks=remarks), header)
+    volume = replace(volume, remarks=remarks, intent=int(header.fields["intent"]), stacked=header.stacked)
+    volume = _with_pixdim(volume, header)
     return volume.in_units_of(*_UNITS.get(int(header.fields["units"]) & 7, (1.0, "mm")))
 
 
@@ -208,7 +218,7 @@ def _scaled(values: NDArray[np.generic], header: _Header) -> NDArray[np.generic]
         return values
     if not math.isfinite(inter):
         raise InputError(f"{header.path} has the intercept {inter} in its header; correct the header")
-    with np.errstate(over="ignore"):
+    with np.errstate(all="ignore"):  # what is not finite is refused later
         found = slope * values.astype(np.float64) + inter
         return found if values.dtype.itemsize > 4 else found.astype(np.float32)
 
@@ -224,6 +234,8 @@ def _rows(header: _Header) -> tuple[NDArray[np.float64], tuple[str, ...]]:
             qform = _qform(header)
         except InputError:  # the sform is what counts
             return sform, ()
+    if qform is not None and not _spans(sform, header.space):
+        return qform, (f"{header.path} has an sform without sense; the qform is used: correct its header",)
     apart = 0.0 if qform is None else _apart(sform, qform, header)
     if not apart > _APART:
         return sform, ()
@@ -232,6 +244,15 @@ def _rows(header: _Header) -> tuple[NDArray[np.float64], tuple[str, ...]]:
         "as in nibabel, FSL and SPM, and tools of ITK may use the qform: correct its header"
     )
     return sform, (text,)
+
+
+def _spans(rows: NDArray[np.float64], size: tuple[int, ...]) -> bool:
+    """Return whether an affine gives every axis of several samples a direction of its own."""
+    columns = rows[:, [k for k, n in enumerate(size[:3]) if n > 1]]
+    with np.errstate(all="ignore"):
+        units = columns / np.linalg.norm(columns, axis=0)
+    finite = bool(np.isfinite(rows).all() and np.isfinite(units).all())
+    return finite and np.linalg.matrix_rank(units, 1e-3) == units.shape[1]
 
 
 def _apart(one: NDArray[np.float64], other: NDArray[np.float64], header: _Header) -> float:
@@ -264,7 +285,7 @@ def _qform(header: _Header) -> NDArray[np.float64]:
 
 def _without_place(header: _Header) -> NDArray[np.float64]:
     lengths = np.abs(header.fields["pixdim"][1:4].astype(np.float64))
-    return np.column_stack([_LPS * np.diag(lengths), np.zeros(3, np.float64)])
+    return np.column_stack([np.diag(lengths * _LPS[:, 0]), np.zeros(3, np.float64)]).astype(np.float64)
 
 
 def place(values: NDArray[np.generic], rows: NDArray[np.float64], path: Path) -> Volume:
@@ -284,8 +305,10 @@ def place(values: NDArray[np.generic], rows: NDArray[np.float64], path: Path) ->
         if size[axis] == 1 and not columns[:, axis].any():
             columns[:, axis] = np.cross(columns[:, axis - 2], columns[:, axis - 1])
             columns[:, axis] /= max(np.linalg.norm(columns[:, axis]), np.finfo(float).tiny)
-    lengths = np.linalg.norm(columns, axis=0)
-    if not lengths.all() or abs(np.linalg.det(columns / lengths)) < 1e-6:
+    with np.errstate(all="ignore"):
+        lengths = np.linalg.norm(columns, axis=0)
+        volume = abs(np.linalg.det(columns / lengths))
+    if not (np.isfinite(lengths).all() and lengths.all() and volume > _SINGULAR):
         raise InputError(f"{path} has an affine that is singular; correct its header")
     values = values.reshape(*size[::-1], -1)
     return Volume(values, tuple(lengths.tolist()), tuple(origin), columns / lengths)

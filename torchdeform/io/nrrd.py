@@ -55,10 +55,7 @@ def nrrd_header(path: Path) -> Header:
     skipped = count(path, "byte skip", fields.get("byte skip", fields.get("byteskip", "0")), -1)
     lines = count(path, "line skip", fields.get("line skip", fields.get("lineskip", "0")), 0)
     start = (0 if data else end) + (max(0, skipped) + lines if packing == "raw" and skipped >= 0 else 0)
-    units = fields.get("space units", fields.get("units", "")).split()
-    return Header(
-        path, space, channels, width, _files(path, data, rest), packing, start, unit_of(units[0] if units else "")
-    )
+    return Header(path, space, channels, width, _files(path, data, rest), packing, start, _unit(path, fields))
 
 
 def _fields(path: Path) -> tuple[dict[str, str], list[str], int]:
@@ -87,6 +84,15 @@ def _split(every: tuple[int, ...], fields: dict[str, str]) -> tuple[tuple[int, .
     spatial = [kind in _SPATIAL for kind in kinds] if len(kinds) == len(every) else [True] * len(every)
     space = tuple(size for size, keep in zip(every, spatial, strict=True) if keep)
     return space, math.prod(every) // math.prod(space)
+
+
+def _unit(path: Path, fields: dict[str, str]) -> tuple[float, str]:
+    """Return the one unit of all axes."""
+    text = fields.get("space units", fields.get("units", ""))
+    found = {unit_of(name) for name in re.findall(r'"([^"]+)"', text) or text.split()}
+    if len(found) > 1:
+        raise InputError(f"{path} has axes in different units, {text[:80]}; write all lengths in mm")
+    return found.pop() if found else unit_of("")
 
 
 def _files(path: Path, data: str, rest: list[str]) -> tuple[Path, ...]:

@@ -15,14 +15,14 @@ from torchdeform.io.gate import DAMAGED
 
 Stream = BinaryIO | gzip.GzipFile
 
-_MAGIC = b"\x1f\x8b"
+MAGIC = b"\x1f\x8b"
 _CHUNK = 1 << 22  # bytes read at once
-_FULL = 1 / 4  # share of what is free on a disk, or of memory, that a file may take unpacked
+_FULL, _LONGEST = 1 / 4, 2e9  # share of what is free on a disk, or of memory, and bytes that a file may take unpacked
 
 
 def is_packed(path: Path) -> bool:
     """Return whether a file is compressed with gzip."""
-    return read_head(path, len(_MAGIC)) == _MAGIC
+    return read_head(path, len(MAGIC)) == MAGIC
 
 
 @contextmanager
@@ -41,7 +41,8 @@ def unpack(path: Path, target: Path) -> None:
     Raises:
         InputError: damaged, or too long for the disk and the memory here.
     """
-    most = _FULL * min(filter(None, (available(), shutil.disk_usage(target.parent).free)), default=1 << 40)
+    free = filter(None, (available(), shutil.disk_usage(target.parent).free))
+    most = min(_LONGEST, *(_FULL * room for room in free))
     with opened(path) as source, target.open("wb") as sink:
         length = 0
         while part := source.read(_CHUNK):

@@ -1,15 +1,15 @@
 """The files that an image is made of: what identifies it is the content of every one of them."""
 
-import re
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from torchdeform.errors import InputError
-from torchdeform.io.dicom import is_dicom
+from torchdeform.io import dicom
+from torchdeform.io.dicom_header import is_dicom, may_be_dicom
 from torchdeform.io.files import is_tiff
 from torchdeform.io.gate import require_beside, require_file
+from torchdeform.io.tiff import tiff_parts
 from torchdeform.io.volumes import volume_files
-
-_OME_NAMES = re.compile(r'(?:FileName|MetadataFile)="([^"]{1,255})"')
 
 
 def files_of(path: Path) -> list[Path]:
@@ -20,8 +20,8 @@ def files_of(path: Path) -> list[Path]:
 
     Returns:
         Regular files only; of a header also its files of pixels, of an OME-TIFF also those of its XML, of a DICOM file
-        or folder all DICOM files of the folder. A file that is damaged, or names others that are not there or lead
-        away from it, is returned alone or with those that can be read: reading it tells what is wrong.
+        those of its series, of a folder all DICOM files in it. A file that is damaged, or names others that are not
+        there or lead away from it, is returned without those: reading it tells what is wrong.
 
     Raises:
         InputError: ``path`` is neither a regular file nor a folder, or cannot be opened.
@@ -30,30 +30,15 @@ def files_of(path: Path) -> list[Path]:
     require_file(path, "image file", folder=True)
     if path.is_dir():
         return sorted(file for file in path.iterdir() if file.is_file() and is_dicom(file))
-    if is_dicom(path):
-        return files_of(path.parent)
-    named = _named_by_tiff(path) if is_tiff(path) else _named_by_header(path)
-    return sorted({path, *(file for file in named if _is_beside(file, path))})
+    named = dicom.files if may_be_dicom(path) else tiff_parts if is_tiff(path) else volume_files
+    return sorted({path, *(file for file in _found(named, path) if _is_beside(file, path))})
 
 
-def _named_by_header(path: Path) -> list[Path]:
+def _found(named: Callable[[Path], Iterable[Path]], path: Path) -> list[Path]:
     try:
-        return list(volume_files(path))
+        return list(named(path))
     except InputError:
         return []
-
-
-def _named_by_tiff(path: Path) -> list[Path]:
-    import tifffile
-
-    try:
-        with tifffile.TiffFile(path) as file:
-            text = file.pages.first.description
-    except Exception as error:
-        if isinstance(error, OSError) and error.errno:
-            raise
-        return []
-    return [path.parent / name for name in _OME_NAMES.findall(text)] if "<OME" in text else []
 
 
 def _is_beside(data: Path, header: Path) -> bool:

@@ -18,6 +18,7 @@ from torchdeform.errors import InputError
 from torchdeform.io import itk
 from torchdeform.io.files import native_stderr, read_head
 from torchdeform.io.gate import DAMAGED, reading, require_room
+from torchdeform.io.loading import load
 
 UNREADABLE = "cannot be read as an image; it may be damaged: export it again"
 
@@ -93,7 +94,9 @@ def picture_size(path: Path) -> tuple[tuple[int, int], int]:
 
 def upright(values: NDArray[np.generic], orientation: int) -> NDArray[np.generic]:
     """Return an array ``(…, y, x)`` turned and mirrored as the orientation tag of EXIF and TIFF says, 1 to 8."""
-    turned = values.swapaxes(-1, -2) if 5 <= orientation <= 8 else values
+    if orientation not in range(2, 9):
+        return values
+    turned = values.swapaxes(-1, -2) if orientation > 4 else values
     rows, columns = -1 if orientation in (3, 4, 7, 8) else 1, -1 if orientation in (2, 3, 6, 7) else 1
     return np.ascontiguousarray(turned[..., ::rows, ::columns])
 
@@ -117,6 +120,8 @@ def _opened(path: Path) -> Iterator[Picture.Image]:
 
 def _require_one(path: Path, picture: Picture.Image) -> None:
     """Raise `InputError` unless the file is one picture that can be in it and fits into memory."""
+    if min(picture.size) < 2:
+        raise InputError(f"{path} has size {list(picture.size)}; give an image with at least two axes")
     pixels, channels = math.prod(picture.size), len(picture.getbands())
     bits = 1 if picture.mode == "1" else 8 * channels
     require_room(path, pixels * bits // 8, held=pixels * 6 * max(3, channels))
@@ -147,7 +152,7 @@ def _orientation(picture: Picture.Image) -> int:
 def _by_itk(path: Path, reader: str) -> Image | None:
     """Return what ITK reads, None where it refuses (for instance grey with alpha)."""
     try:
-        return itk.to_image(itk.load(path, reader), str(path))
+        return itk.to_image(load(path, reader), str(path))
     except RuntimeError:
         return None
 

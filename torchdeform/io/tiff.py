@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,6 +19,7 @@ from torchdeform.errors import InputError
 from torchdeform.io.gate import CROP, DAMAGED, reading, require_beside, require_room
 from torchdeform.io.tiff_pixels import orientation_of, require_colours, shown, unpacked
 from torchdeform.io.tiff_scale import Scale, scale
+from torchdeform.io.volume import held_type
 
 if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPageSeries
@@ -43,11 +44,12 @@ _KEPT = 4  # bytes of a number of float32, which all become
 _TYPES = ("uint8", "uint16", "float32")  # of ImageJ
 
 
-def read_tiff(path: Path) -> Image:
+def read_tiff(path: Path, *, exact: bool = False) -> Image:
     """Read a TIFF: one page as a 2D image, pages as a volume, a slide at its full size.
 
     Args:
         path: the file.
+        exact: whether the pixels become float64 where float32 would merge values of their type.
 
     Raises:
         InputError: damaged, larger than what is free, packed or coloured in a way that is unknown here, pages of
@@ -68,7 +70,7 @@ def read_tiff(path: Path) -> Image:
         pixels = shown(_ordered(axes, values), page)
         if orientation_of(page) > 4:
             found = ((found[0][0], found[0][2], found[0][1]), found[1])
-        return _image(pixels, found, str(path))
+        return _image(pixels, found, str(path), held_type(pixels.dtype, exact=exact))
 
 
 def tiff_size(path: Path) -> tuple[tuple[int, ...], int]:
@@ -108,8 +110,11 @@ def _parts(text: str, path: Path) -> list[Path]:
     others = [e for e in root.iterfind(".//{*}TiffData/{*}UUID") if e.text is None or e.text != root.get("UUID")]
     names = dict.fromkeys(e.get("FileName", path.name) for e in others)
     parts = [path.parent / name for name in names if name.lower() != path.name.lower()]
-    for part in parts:
-        require_beside(part, path)
+    try:
+        for part in parts:
+            require_beside(part, path)
+    except InputError as error:
+        raise InputError(f"{path} is an image in several files: {error}") from None
     return parts
 
 
@@ -145,9 +150,11 @@ def _log_messages() -> Iterator[list[str]]:
 
 def _shown_series(file: "TiffFile") -> "Series":
     """Return the series of pages that show what the file is of: no smaller copies, masks, labels or macros."""
-    full = [one for one in file.series if not int(one.keyframe.subfiletype) & (_REDUCED | _MASK)]
-    full = [one for one in full if not any(word in one.name.lower() for word in _ASIDE)] or file.series
-    return [max(full, key=lambda one: one.size)] if file.flags & _SLIDES else full
+    full = [one for one in file.series if not int(one.keyframe.subfiletype) & (_REDUCED | _MASK)] or file.series
+    largest = max(full, key=lambda one: one.size)
+    if file.flags & _SLIDES:
+        return [largest]
+    return [one for one in full if one.size == largest.size or not any(word in one.name.lower() for word in _ASIDE)]
 
 
 def _require_one(series: "Series", path: Path) -> tuple[str, tuple[int, ...]]:
@@ -158,7 +165,7 @@ def _require_one(series: "Series", path: Path) -> tuple[str, tuple[int, ...]]:
         sizes = ", ".join("×".join(map(str, s.shape)) for s in series[:3])
         raise InputError(f"{path} has pages of different sizes ({sizes}); save the page that you want and give that")
     several = {axis: n for axis, n in zip(first.axes, first.shape, strict=True) if n > 1}
-    if others and not set(several) & set(_DEPTH):  # pages written one by one
+    if others and first.kind != "ome" and not set(several) & set(_DEPTH):  # pages written one by one
         return _DEPTH[0] + first.axes, (1 + len(others), *first.shape)
     other = [n for axis, n in several.items() if axis not in "YX" + _DEPTH + _CHANNELS]
     if other or others:
@@ -202,13 +209,13 @@ def _ordered(axes: str, values: NDArray[np.generic]) -> NDArray[np.generic]:
     return ordered.reshape(channels, -1, *ordered.shape[-2:])
 
 
-def _image(pixels: NDArray[np.generic], found: Scale, name: str) -> Image:
+def _image(pixels: NDArray[np.generic], found: Scale, name: str, held: np.dtype[Any]) -> Image:
     """Return pixels ``(C, Z, Y, X)`` as an image without axes of one sample."""
     used = [k for k in range(3) if pixels.shape[k + 1] > 1]
     if len(used) < 2:
         raise InputError(f"{name} has size {list(pixels.shape[1:])}; give an image with at least two axes")
     (spacing, unit), shape = found, tuple(pixels.shape[k + 1] for k in used)
-    data = torch.from_numpy(np.ascontiguousarray(pixels, dtype=np.float32).reshape(1, -1, *shape))
+    data = torch.from_numpy(np.ascontiguousarray(pixels, dtype=held).reshape(1, -1, *shape))
     kind = "uint8" if pixels.dtype.kind == "b" else pixels.dtype.name
     return Image(data, Grid(shape, tuple(spacing[k] for k in used)), name=name, pixel_type=kind, unit=unit)
 

@@ -63,9 +63,9 @@ def unpacked(series: "Series", path: Path) -> NDArray[Any]:
     try:
         if int(page.photometric) == _YCBCR and int(page.compression) not in _UNPACKED_COLOURS:
             raise NotImplementedError("tifffile leaves YCbCr as it is")
-        return np.stack([one.asarray() for one in series])
+        return np.stack([one.asarray() for one in series]) if len(series) > 1 else series[0].asarray()
     except (ImportError, NotImplementedError, ValueError) as error:
-        if type(error) is ValueError and "imagecodecs" not in str(error):
+        if isinstance(error, ValueError) and "imagecodecs" not in str(error):
             raise
     found = _by_pillow(series, path)
     if found is None:

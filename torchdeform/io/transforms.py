@@ -1,7 +1,7 @@
 """Displacement fields and transforms on disk, as ITK reads them: LPS mm in x, y, z order, points fixed -> moving."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
@@ -11,12 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Stage, Transform
 from torchdeform.errors import InputError
-from torchdeform.io import itk
-from torchdeform.io.files import atomic_folder, native_stderr, require_space, suffix
+from torchdeform.io import elastix, itk, itk_maps, matrices
+from torchdeform.io.files import atomic_folder, native_stderr, read_head, require_space, suffix
 from torchdeform.io.gate import require_file
+from torchdeform.io.loading import reason
+from torchdeform.io.maps import Field, Linear, Spline
+from torchdeform.io.volume import Volume
 from torchdeform.io.volumes import read_volume
 
 if TYPE_CHECKING:
@@ -29,8 +33,13 @@ COMPOSITES = (".h5", ".hdf5")
 AFFINES = (".tfm", ".txt", ".mat")
 FIELDS = (".nii.gz", ".nii", ".mha", ".mhd", ".nrrd")
 
-# A linear map is evaluated at points this far (mm) from the origin, so that large offsets cost its matrix no digits.
-_STEP = 1024.0
+
+# NIfTI's intents of warps that FSL writes: fields and coefficients.
+_FSL_INTENTS = (2006, 2007, 2008, 2009)
+# Voxels around the domain of a spline that still belong to it.
+_NONE = 1e-6
+# Vectors that miss the places of their voxels by a smaller share of the places' spread are positions.
+_POSITIONS = 0.2
 
 
 def write_displacement(u: Tensor, fixed: Image, path: _Path) -> None:
@@ -59,11 +68,32 @@ def read_displacement(path: _Path) -> Image:
         An image whose ``data`` is u ``(1, D, *S)`` in array order and units of spacing, with its grid and position.
 
     Raises:
-        InputError: the file is missing, damaged, or not a field of D components.
+        InputError: the file is missing, damaged, a field of FSL or of positions, or not a field of D components.
+
+    Notes:
+        The components may also stand on a fourth axis ``(x, y, z, 3)``, as arrays have them; they too are LPS mm.
     """
     file = Path(path)
     require_file(file, "displacement field")
-    return _to_field(itk.volume_image(read_volume(file), str(path)))
+    volume = read_volume(file, vectors=True)
+    if volume.intent in _FSL_INTENTS:
+        raise InputError(
+            f"{path} is a warp of FSL; convert it with `wb_command -convert-warpfield -from-fnirt {file.name} "
+            "moving.nii.gz -to-itk field.nii.gz`"
+        )
+    if volume.stacked:
+        _require_displacements(volume, file)
+    return _to_field(itk.volume_image(volume, str(path)))
+
+
+def _require_displacements(volume: Volume, path: Path) -> None:
+    """Raise `InputError` if vectors are rather the positions that nodes go to, in LPS or RAS, than displacements."""
+    index = np.stack(np.meshgrid(*map(np.arange, volume.size), indexing="ij"), axis=-1) * volume.spacing
+    places = index @ volume.direction.T + volume.origin
+    values = volume.values.swapaxes(0, -2)[..., :2].astype(np.float64)
+    for positions in (places[..., :2], -places[..., :2]):
+        if np.std(values - positions) < _POSITIONS * np.std(positions):
+            raise InputError(f"{path} holds positions, not displacements; subtract from each voxel its place in LPS mm")
 
 
 def voxel_displacement(u: Tensor, fixed: Image, moving: Image) -> Tensor:
@@ -165,80 +195,64 @@ def require_transform_file(path: Path, transform: Transform | None = None) -> No
 
 
 def read_transform(path: _Path) -> Transform:
-    """Read a transform of ITK, ANTs or this library. It maps points from fixed to moving, images the other way.
+    """Read a transform of ITK, ANTs, elastix, greedy, FreeSurfer or this library. It maps points from fixed to moving.
 
     Args:
-        path: a transform file (``.h5``, ``.tfm``, ``.txt``, ``.mat``, such as ``0GenericAffine.mat`` of ANTs) with
-            linear maps of any kind, displacement fields, or composites of them; or a displacement field as an image
-            (``.nii.gz``, ``.mha``, ``.nrrd``, such as ``1Warp.nii.gz`` of ANTs).
+        path: a file of ITK (``.h5``, ``.tfm``, ``.txt``, ``.mat``, such as ``0GenericAffine.mat`` of ANTs) with linear
+            maps of any kind, displacement fields, B-splines, or composites of them; ``TransformParameters.0.txt`` of
+            elastix; a matrix as text (RAS, as greedy and c3d write it); an LTA of FreeSurfer; or a displacement field
+            as an image (``.nii.gz``, ``.mha``, ``.nrrd``, such as ``1Warp.nii.gz`` of ANTs).
 
     Returns:
-        The transform, float64. Its `reference` is the grid of a displacement that comes first.
+        The transform, float64. Its `reference` is the grid of a displacement that comes first. A B-spline becomes a
+        displacement on its domain, whose linear interpolation misses it by 0.02 mm at most, or by 0.01 of a cell of
+        its mesh where that would take more than 2²⁴ nodes.
 
     Raises:
-        InputError: the file is missing, damaged, of another kind, or holds a transform that is neither linear nor a
-            displacement field (for instance a B-spline).
+        InputError: the file is missing, damaged, of another kind, or holds a transform of another kind.
+
+    Notes:
+        Images go the other way than points.
     """
     file = Path(path)
-    require_file(file, "transform")
+    require_file(file, "transform file")
     if suffix(file) in FIELDS:
         field = read_displacement(file)
         return Transform((Displacement(replace(field, data=field.data.double())),))
-    return Transform(tuple(_stages(_load(file), str(path))))
+    return Transform(tuple(_stage(part, str(path)) for part in _maps(file)))
 
 
-def _load(path: Path) -> "sitk.Transform":
-    import SimpleITK as sitk
-
-    try:
-        with native_stderr() as printed:
-            transform = sitk.ReadTransform(str(path))
-    except RuntimeError as error:
-        hint = f"give an ITK transform ({', '.join((*COMPOSITES, *AFFINES))}) or a displacement field"
-        raise InputError(f"{path} cannot be read as a transform; {hint}") from error
-    if any("more than one transform" in line for line in printed):
-        raise InputError(f"{path} holds several transforms side by side; write them as one composite, .h5")
-    if transform.GetDimension() not in (2, 3):
-        raise InputError(f"{path} is a transform of {transform.GetDimension()}D; give one of 2D or 3D")
-    return transform
+def _maps(path: Path) -> Sequence[Linear | Field | Spline]:
+    """Return the maps of a file by its content: a text of elastix, a matrix, else what ITK reads."""
+    head = read_head(path, 4096)
+    if elastix.is_elastix(head):
+        return elastix.read(path)
+    if matrices.is_matrix(head):
+        return matrices.read(path)
+    known = f"an ITK transform ({', '.join((*COMPOSITES, *AFFINES))}) or a displacement field"
+    return itk_maps.read(path, known)
 
 
-def _stages(transform: "sitk.Transform", name: str) -> list[Stage]:
-    """Return the stages of ITK's transform in the order in which they are applied to points; ITK stores the reverse."""
-    import SimpleITK as sitk
-
-    if transform.IsLinear():  # true for composites of linear maps, too
-        return [_linear(transform, name)]
-    transform = transform.Downcast()
-    if isinstance(transform, sitk.CompositeTransform):
-        parts = [transform.GetNthTransform(k) for k in reversed(range(transform.GetNumberOfTransforms()))]
-        return [stage for part in parts for stage in _stages(part, name)]
-    if isinstance(transform, sitk.DisplacementFieldTransform):
-        return [Displacement(_field_of(transform.GetDisplacementField(), name))]
-    raise InputError(
-        f"{name} holds a {transform.GetName()}, which cannot be read here; convert it to a displacement field"
-    )
+def _stage(part: Linear | Field | Spline, name: str) -> Stage:
+    if isinstance(part, Linear):
+        try:
+            return Affine(torch.from_numpy(part.matrix), torch.from_numpy(part.offset))
+        except InputError as error:
+            raise InputError(f"{name} cannot be used: {error}; make it again") from error
+    if isinstance(part, Spline):  # it ends at its last nodes
+        return Displacement(_field_of(part.dense(name), name), margin=_NONE)
+    return Displacement(_field_of(part, name))
 
 
-def _linear(transform: "sitk.Transform", name: str) -> Affine:
-    """Return a linear map of any kind, found from where it maps the origin and one point on each axis."""
-    dim = transform.GetDimension()
-    ends = [transform.TransformPoint([_STEP * (k == axis) for k in range(dim)]) for axis in range(-1, dim)]
-    offset, *columns = torch.tensor(ends, dtype=torch.float64)
-    try:
-        return Affine((torch.stack(columns, dim=1) - offset.unsqueeze(1)) / _STEP, offset)
-    except InputError as error:
-        raise InputError(f"{name} cannot be used: {error}; make it again") from error
-
-
-def _field_of(field: "sitk.Image", name: str) -> Image:
-    """Return a displacement field with float64 vectors, as composite files have them."""
-    import SimpleITK as sitk
-
-    image = itk.to_image(field, name)
-    values = torch.from_numpy(sitk.GetArrayFromImage(field)).double()
-    data = values.view(1, *image.grid.shape, -1).movedim(-1, 1).contiguous()
-    return _to_field(replace(image, data=data))
+def _field_of(field: Field, name: str) -> Image:
+    """Return a field as u in array order and units of spacing, float64."""
+    if not np.isfinite(field.vectors).all():
+        raise InputError(f"{name} holds vectors that are not finite; make it again")
+    if min(field.vectors.shape[:-1]) < 2:
+        raise InputError(f"{name} has a field of a single node along an axis; make it again on two nodes at least")
+    grid = Grid(field.vectors.shape[:-1], tuple(map(float, field.spacing[::-1])))
+    data = torch.from_numpy(np.moveaxis(field.vectors, -1, 0).copy())[None]
+    return _to_field(Image(data, grid, tuple(field.origin), tuple(map(tuple, field.direction)), name))
 
 
 def _to_field(vectors: Image) -> Image:
@@ -283,7 +297,7 @@ def _save(transform: "sitk.Transform", path: Path) -> None:
             with native_stderr():
                 sitk.WriteTransform(transform, str(folder / path.name))
         except RuntimeError as error:
-            raise InputError(f"{path} cannot be written: {itk.reason(error)}; use the ending .h5") from error
+            raise InputError(f"{path} cannot be written: {reason(error)}; use the ending .h5") from error
 
 
 def _check_field(u: Tensor, fixed: Image, name: str) -> None:

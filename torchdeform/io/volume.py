@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,9 @@ from torchdeform.errors import InputError
 
 NOT_SQUARE = "has axes that are not at right angles; reslice it onto a rectangular grid first"
 NOT_FINITE = "has pixels that are NaN or infinite; replace them first, for instance by 0"
+
+# Types whose values float32, in which images are read, cannot all represent.
+_WIDE = ("int32", "uint32", "int64", "uint64", "float64")
 
 # How much the products of the columns of a direction matrix may deviate from those of right angles: headers with three
 # digits deviate by up to this much. Less than the second number is left as it is.
@@ -29,6 +33,8 @@ class Volume:
         direction: world directions of the axes x, y, z as columns.
         unit: what its lengths are shown in, see `Image`.
         remarks: sentences about what the reader had to decide.
+        intent: NIfTI's code of what the numbers are, 0 for none.
+        stacked: whether the numbers of a pixel stand on the fourth axis of the file, as volumes of a series do.
     """
 
     values: NDArray[np.generic]
@@ -37,6 +43,8 @@ class Volume:
     direction: NDArray[np.float64]
     unit: str = "mm"
     remarks: tuple[str, ...] = ()
+    intent: int = 0
+    stacked: bool = False
 
     @property
     def size(self) -> tuple[int, ...]:
@@ -47,6 +55,11 @@ class Volume:
         """Return the volume whose numbers were in units of ``length`` mm."""
         scaled = [tuple(length * value for value in numbers) for numbers in (self.spacing, self.origin)]
         return replace(self, spacing=scaled[0], origin=scaled[1], unit=unit)
+
+
+def held_type(kind: np.dtype[Any], *, exact: bool) -> np.dtype[Any]:
+    """Return the type that pixels of a file get: float32, or float64 where ``exact`` and float32 merges values."""
+    return np.dtype("float64" if exact and kind.name in _WIDE else "float32")
 
 
 def squared(direction: NDArray[np.float64], name: str) -> NDArray[np.float64]:
@@ -65,6 +78,11 @@ def squared(direction: NDArray[np.float64], name: str) -> NDArray[np.float64]:
         return direction
     left, _, right = np.linalg.svd(direction)
     return np.asarray(left @ right, np.float64)
+
+
+def is_stack(size: Sequence[int]) -> bool:
+    """Return whether the fourth axis can hold vectors: it has as many numbers as there are axes of space."""
+    return len(size) == 4 and size[3] == sum(n > 1 for n in size[:3])
 
 
 def require_one(path: Path, size: Sequence[int]) -> None:

@@ -3,10 +3,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from torchdeform.errors import InputError
 from torchdeform.io.files import suffix
 from torchdeform.io.headers import Header
 from torchdeform.io.isolated import isolated
-from torchdeform.io.kinds import ANALYZE, META, MGH, NIFTI, NRRD, kind_of
+from torchdeform.io.kinds import ANALYZE, META, MGH, NIFTI, NRRD, kind_of, known_otherwise
 from torchdeform.io.loading import read_by_itk, size_by_itk
 from torchdeform.io.metaimage import metaimage_header
 from torchdeform.io.mgh import mgh_size, read_mgh
@@ -19,14 +20,16 @@ _TEXT_HEADERS: dict[str, tuple[Callable[[Path], Header], str]] = {
     META: (metaimage_header, "MetaImageIO"),
     NRRD: (nrrd_header, "NrrdImageIO"),
 }
+_PIXELS = (".raw", ".zraw", ".raw.gz", ".img", ".img.gz")
 _SIZES = {NIFTI: nifti_size, ANALYZE: nifti_size, MGH: mgh_size}
 
 
-def read_volume(path: Path) -> Volume:
+def read_volume(path: Path, *, vectors: bool = False) -> Volume:
     """Read NIfTI, MGH, MetaImage, NRRD, Analyze, or another format that ITK knows.
 
     Args:
         path: a regular file, see `require_file`; either of the two of a pair.
+        vectors: whether a fourth axis of D numbers holds vectors, instead of volumes of a series.
 
     Raises:
         InputError: damaged, of no known format, a series, or with a header that makes no sense.
@@ -37,18 +40,19 @@ def read_volume(path: Path) -> Volume:
     file = header_of_pair(path)
     kind = kind_of(file)
     if kind == NIFTI:
-        return read_nifti(file)
+        return read_nifti(file, vectors=vectors)
     if kind == MGH:
         return read_mgh(file)
     if kind == ANALYZE:
         nifti_size(file)
-        return isolated(read_by_itk, file, "NiftiImageIO", path=file)
+        return isolated(read_by_itk, file, "NiftiImageIO", vectors, path=file)
     if kind not in _TEXT_HEADERS:
-        return isolated(read_by_itk, file, path=file)
+        _require_image(file)
+        return isolated(read_by_itk, file, "", vectors, path=file)
     read_header, reader = _TEXT_HEADERS[kind]
     header = read_header(file)
     header.require_complete()
-    return isolated(read_by_itk, file, reader, path=file, size=header.stored).in_units_of(*header.unit)
+    return isolated(read_by_itk, file, reader, vectors, path=file, size=header.stored).in_units_of(*header.unit)
 
 
 def volume_size(path: Path) -> tuple[tuple[int, ...], int] | None:
@@ -90,3 +94,16 @@ def header_of_pair(path: Path) -> Path:
             if header.is_file():
                 return header
     return path
+
+
+def _require_image(path: Path) -> None:
+    """Raise `InputError` for a file that is certainly something else, or pixels without their header."""
+    if found := known_otherwise(path):
+        raise InputError(f"{path} {found}")
+    if suffix(path) not in _PIXELS:
+        return
+    name = path.name.removesuffix(suffix(path))
+    for ending in (".mhd", ".nhdr", ".hdr"):
+        if path.with_name(name + ending).is_file():
+            raise InputError(f"{path} holds pixels only; give its header, {name}{ending}")
+    raise InputError(f"{path} holds pixels only; put its header (.mhd, .nhdr or .hdr) beside it and give that")

@@ -88,6 +88,8 @@ def ngf(
         "Intensity gradient based registration and fusion of multi-modal images", 2007.
     """
     fixed, warped = on_unit_scale(fixed, warped, mask, intensity_range)
+    if len(fixed) == 0:
+        return mean(warped)
     grid = grid or Grid(tuple(fixed.shape[2:]))
     weight = relative_weight(_smallest_in_stencil(mask), warped)
     f, w = _gradient(fixed, grid), _gradient(warped, grid)

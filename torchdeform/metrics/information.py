@@ -11,6 +11,7 @@ from torchdeform.metrics.base import (
     IntensityRange,
     Similarity,
     at_least_float32,
+    mean,
     on_unit_scale,
     relative_weight,
     weighted,
@@ -174,6 +175,8 @@ def _from_images(
     """Return S from the histogram itself, summed in float64, which autograd can follow."""
     _checked_bins(bins)
     fixed, warped = on_unit_scale(*images, mask, intensity_range)
+    if len(fixed) == 0:
+        return mean(warped)
     weight = relative_weight(mask, warped)
     column, s = _cells(fixed, bins - 1)
     row, t = _cells(warped, bins - 3)

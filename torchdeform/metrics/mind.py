@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchdeform.core.grid import magnitude
 from torchdeform.core.resampling import box_sum
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import DIMENSIONS, at_least_float32
@@ -45,6 +46,7 @@ def mind_ssc(image: Tensor, *, radius: int = 1, dilation: int = 1) -> Tensor:
     if radius < 0 or dilation < 1:
         raise InputError(f"mind_ssc: radius must be at least 0 and dilation at least 1, got {radius} and {dilation}")
     image = at_least_float32(image)
+    image = image / magnitude(image)  # whose squares are finite
     distance = _patch_distances(image, radius, dilation)
     distance = distance - distance.amin(dim=2, keepdim=True)
     return torch.exp(-distance / _variance(distance, image)).flatten(1, 2)

@@ -10,11 +10,13 @@ from functools import lru_cache
 
 import torch
 from torch import Tensor
+from torch.autograd import Function
 
 from torchdeform.core.derivatives import CURL_PAIRS, curl, jacobian_determinant
 from torchdeform.core.diagnostics import smallest_determinant
 from torchdeform.core.fold_free import largest_share
-from torchdeform.core.grid import Grid, per_item
+from torchdeform.core.grid import Grid, over_items, per_item
+from torchdeform.core.tables import in_transformation
 from torchdeform.fem.solver import solver_of
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
@@ -31,7 +33,8 @@ def _factor(like: Tensor, spacing: Sequence[float], weights: Sequence[float], bo
     if not hasattr(_local, "make"):
         _local.make = lru_cache(maxsize=16)(_make_factor)
     grid = _grid_of(like, spacing)
-    return _local.make(grid, tuple(weights), boundary, solver, like.dtype, like.device)
+    make = _make_factor if in_transformation() else _local.make
+    return make(grid, tuple(weights), boundary, solver, like.dtype, like.device)
 
 
 def _make_factor(
@@ -46,13 +49,25 @@ def _grid_of(field: Tensor, spacing: Sequence[float]) -> Grid:
     return Grid(tuple(field.shape[2:]), tuple(spacing))
 
 
-@torch.library.custom_op("torchdeform::div_curl_velocity", mutates_args=())
 def div_curl_velocity(
     data: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str, solver: str = "auto"
 ) -> Tensor:
     """Return v = K⁻¹ A data: the velocity of divergence and curl ``data (B, 1 + C, *S)``, see `DivCurlVelocity`."""
+    how = data, spacing, weights, boundary, solver
+    return _velocity(*how) if in_transformation() else _velocity_operator(*how)
+
+
+def _velocity(data: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str, solver: str) -> Tensor:
+    """Return the same by what `torch.func` can transform, which operators of torch cannot be."""
     factor = _factor(data, spacing, weights, boundary, solver)
     return factor(factor.system.load(div=data[:, :1], curl=data[:, 1:]))
+
+
+@torch.library.custom_op("torchdeform::div_curl_velocity", mutates_args=())
+def _velocity_operator(
+    data: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str, solver: str = "auto"
+) -> Tensor:
+    return _velocity(data, spacing, weights, boundary, solver)
 
 
 @torch.library.custom_op("torchdeform::div_curl_adjoint", mutates_args=())
@@ -69,7 +84,7 @@ def div_curl_adjoint(
     return torch.cat(found, dim=1)
 
 
-@div_curl_velocity.register_fake
+@_velocity_operator.register_fake
 def _(data: Tensor, spacing: Sequence[float], weights: Sequence[float], boundary: str, solver: str = "auto") -> Tensor:
     return data.new_empty(data.shape[0], data.dim() - 2, *data.shape[2:])
 
@@ -84,15 +99,14 @@ def _remember(ctx, inputs, output) -> None:
 
 
 # Each is the derivative of the other, so derivatives of every degree are there.
-div_curl_velocity.register_autograd(
+_velocity_operator.register_autograd(
     lambda ctx, slope: (div_curl_adjoint(slope, *ctx.settings), None, None, None, None), setup_context=_remember
 )
 div_curl_adjoint.register_autograd(
-    lambda ctx, slope: (div_curl_velocity(slope, *ctx.settings), None, None, None, None), setup_context=_remember
+    lambda ctx, slope: (_velocity_operator(slope, *ctx.settings), None, None, None, None), setup_context=_remember
 )
 
 
-@torch.library.custom_op("torchdeform::share_within_bounds", mutates_args=())
 def share_within_bounds(u: Tensor, spacing: Sequence[float], min_det: float, max_det: float, max_curl: float) -> Tensor:
     """Return for each item the share t ≤ 1 that leaves φ = id + t u within bounds, ``(B,)``.
 
@@ -110,6 +124,32 @@ def share_within_bounds(u: Tensor, spacing: Sequence[float], min_det: float, max
         Costs one look at the determinants, and eight more for the items that must be scaled down. Not differentiable:
         layers take t for a constant. NaN is never within bounds.
     """
+    how = u, spacing, min_det, max_det, max_curl
+    return _Share.apply(*how) if in_transformation() else _share_operator(*how)
+
+
+class _Share(Function):
+    """`share_within_bounds` for `torch.func`."""
+
+    @staticmethod
+    def forward(u: Tensor, spacing: Sequence[float], min_det: float, max_det: float, max_curl: float) -> Tensor:
+        return _share(u, spacing, min_det, max_det, max_curl)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.mark_non_differentiable(output)
+
+    @staticmethod
+    def vmap(info, in_dims, u: Tensor, *bounds):
+        return over_items(lambda items: _Share.apply(items, *bounds), u, in_dims[0]), 0
+
+
+@torch.library.custom_op("torchdeform::share_within_bounds", mutates_args=())
+def _share_operator(u: Tensor, spacing: Sequence[float], min_det: float, max_det: float, max_curl: float) -> Tensor:
+    return _share(u, spacing, min_det, max_det, max_curl)
+
+
+def _share(u: Tensor, spacing: Sequence[float], min_det: float, max_det: float, max_curl: float) -> Tensor:
     grid = _grid_of(u, spacing)
 
     def within(w: Tensor) -> Tensor:
@@ -128,6 +168,6 @@ def share_within_bounds(u: Tensor, spacing: Sequence[float], min_det: float, max
     return share
 
 
-@share_within_bounds.register_fake
+@_share_operator.register_fake
 def _(u: Tensor, spacing: Sequence[float], min_det: float, max_det: float, max_curl: float) -> Tensor:
     return u.new_empty(u.shape[0])

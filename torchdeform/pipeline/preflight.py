@@ -103,8 +103,8 @@ def preflight(
         *(Finding(WARNING, text) for image in given for text in image.remarks),
         *_check_values(fixed),
         *_check_values(moving),
-        *_check_nodes(fixed, ERROR),
-        *_check_nodes(moving, WARNING),
+        *_check_nodes(fixed),
+        *_check_nodes(moving),
         *_check_spacing(fixed, moving),
         *_check_spacing(moving, fixed),
     ]
@@ -164,10 +164,12 @@ def _check_values(image: Image) -> Iterator[Finding]:
         yield Finding(WARNING, f"{image.name} is 0 in {zeros:.1%} of its pixels; crop it to what is to be aligned")
 
 
-def _check_nodes(image: Image, severity: str) -> Iterator[Finding]:
+def _check_nodes(image: Image) -> Iterator[Finding]:
     if min(image.grid.shape) < MIN_NODES:
-        text = f"{image.name} has the size {image.grid.size_text}; every axis needs at least {MIN_NODES} voxels"
-        yield Finding(severity, f"{text}: resample it")
+        text = (
+            f"{image.name} has the size {image.grid.size_text}; nothing is moved along axes of fewer than {MIN_NODES}"
+        )
+        yield Finding(NOTE, f"{text} voxels")
 
 
 def _check_spacing(image: Image, partner: Image) -> Iterator[Finding]:

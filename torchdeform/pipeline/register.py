@@ -1,6 +1,7 @@
 """One pair of image files: reading and checking, registration, and the folder of results."""
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from time import perf_counter
@@ -18,11 +19,13 @@ from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.io import read_image, write_displacement, write_image, write_transform
 from torchdeform.io.files import atomic_folder, require_writable
 from torchdeform.io.images import ending_like, read_labels, read_optional, require_storable, write_labels
+from torchdeform.io.point_tables import FIXED, MOVING
 from torchdeform.io.points import matched, read_points
 from torchdeform.io.texts import read_json
 from torchdeform.metrics.evaluation import common_labels
+from torchdeform.pipeline.annotations import check_labels, check_points
 from torchdeform.pipeline.memory import advice, fitting_grid, footprint
-from torchdeform.pipeline.preflight import WARNING, preflight
+from torchdeform.pipeline.preflight import WARNING, Finding, Report, preflight
 from torchdeform.registration.deformable import resample_result
 from torchdeform.registration.problem import Annotations
 from torchdeform.registration.result import Callback, RegistrationResult
@@ -131,7 +134,8 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
         memory: bytes that a coarser grid keeps the registration to, see `preflight`.
 
     Raises:
-        InputError: a file cannot be read, `preflight` finds an error, or the labels do not fit.
+        InputError: a file cannot be read, `preflight` finds an error, or landmarks or labels do not belong to
+            their image.
     """
     files.require_pairs()
     fixed, moving = read_image(files.fixed), read_image(files.moving)
@@ -156,17 +160,32 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
         **_read_points(files, fixed, moving),
     )
     annotations.require_images(fixed.grid.dim)
+    found = Report(tuple(_check_annotations(files, (fixed, moving), annotations)))
+    found.require_ok()
     if labels[0] is not None and labels[1] is not None:  # some must be the same, or nothing can be measured
         first = resample(labels[0], fixed, mode="nearest")
         common_labels(first, labels[1].data, names=(labels[0].name, labels[1].name))
-    return Inputs(fixed, moving, annotations, report.of(WARNING))
+    remarks = [text for image in labels if image is not None for text in image.remarks]
+    return Inputs(fixed, moving, annotations, (*report.of(WARNING), *found.of(WARNING), *remarks))
+
+
+def _check_annotations(files: PairFiles, images: tuple[Image, Image], annotations: Annotations) -> Iterator[Finding]:
+    """Yield what looks wrong with the landmarks and the labels of both images."""
+    for side, image in zip((FIXED, MOVING), images, strict=True):
+        points, labels = (getattr(annotations, f"{side}_{what}") for what in ("points", "labels"))
+        if points is not None:
+            yield from check_points(image, points[0].T, getattr(files, f"{side}_points"))
+        if isinstance(labels, Image):
+            yield from check_labels(image, labels)
 
 
 def _read_points(files: PairFiles, fixed: Image, moving: Image) -> dict[str, Tensor]:
     """Return corresponding landmarks in the world, ``(1, D, n)`` each, by the names that `Annotations` has for them."""
     if files.fixed_points is None or files.moving_points is None:
         return {}
-    first, second, _ = matched(read_points(files.fixed_points, fixed), read_points(files.moving_points, moving))
+    first, second, _ = matched(
+        read_points(files.fixed_points, fixed, side=FIXED), read_points(files.moving_points, moving, side=MOVING)
+    )
     return {"fixed_points": first.T.unsqueeze(0), "moving_points": second.T.unsqueeze(0)}
 
 

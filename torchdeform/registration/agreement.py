@@ -45,7 +45,7 @@ def disagreement(problem: RegistrationProblem, settings: RegistrationSettings) -
     """
     rough = problem.on(with_nodes(problem.grid, ROUGH[problem.grid.dim]))
     grid = Grid(rough.grid.shape)  # in voxels
-    both = RegistrationProblem(grid, *_there_and_back(rough.fixed, rough.moving), *_masks(rough))
+    both = RegistrationProblem(grid, *_there_and_back(rough.fixed, rough.moving), *_masks(rough), held=rough.held)
     with limit_threads(1, grid):
         quick = replace(_SETTINGS, solver=settings.solver, stencil=settings.stencil)
         there, back = _maps(both, quick).chunk(2)

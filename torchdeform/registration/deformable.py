@@ -11,7 +11,7 @@ from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid, limit_threads
 from torchdeform.core.image import Image, resample, same_place
 from torchdeform.core.intensities import require_finite
-from torchdeform.core.resampling import MIN_NODES, prolong
+from torchdeform.core.resampling import prolong
 from torchdeform.core.stages import begin
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import invert, warp
@@ -22,7 +22,7 @@ from torchdeform.registration.absence import let_go, moved_with
 from torchdeform.registration.agreement import disagreement
 from torchdeform.registration.discrete import discrete_start
 from torchdeform.registration.evidence import gather_evidence, to_compare, with_labels
-from torchdeform.registration.optimise import best_map, common_mask, forward_objective, optimise_levels
+from torchdeform.registration.optimise import best_map, common_mask, forward_objective, held_still, optimise_levels
 from torchdeform.registration.placement import Placement, place, problem_at
 from torchdeform.registration.problem import (
     Annotations,
@@ -72,7 +72,7 @@ def register(
         are compared (see `corresponding_channels`), and ``warped`` is the moving image sampled once.
 
     Raises:
-        InputError: shapes, fewer than 8 nodes on an axis, NaN or constant images, 2D against 3D, channels that do not
+        InputError: shapes, NaN or constant images, 2D against 3D, channels that do not
             correspond, a start that folds, annotations that does not fit.
         ComputationError: the map is not finite.
 
@@ -144,14 +144,8 @@ def _checked_grid(fixed: Tensor, moving: Tensor, annotations: Annotations) -> Gr
         grid.check(image, f"register: {name}", components=fixed.shape[1])
     if fixed.shape[0] != moving.shape[0] or fixed.dtype != moving.dtype or fixed.device != moving.device:
         raise InputError("register: fixed and moving must agree in batch size, dtype and device")
-    _require_size(grid)
     annotations.require_tensors(grid, fixed.shape[0])
     return grid
-
-
-def _require_size(grid: Grid) -> None:
-    if min(grid.shape) < MIN_NODES:
-        raise InputError(f"register: every axis must have at least {MIN_NODES} voxels, got {grid.shape}")
 
 
 def _register_images(
@@ -164,7 +158,6 @@ def _register_images(
     callback: Callback | None,
 ) -> RegistrationResult:
     """Take the moving image onto the fixed grid in its physical place, register, and sample the original once."""
-    _require_size(fixed.grid)
     annotations.require_images(fixed.grid.dim)
     placed = affine if isinstance(affine, Placement) else place(fixed, moving, settings, annotations, affine)
     both, settings, affine = placed_images(fixed, moving, annotations), placed.settings, placed.affine
@@ -239,6 +232,8 @@ def _optimise(
         start = discrete_start(
             problem.fixed, problem.moving, problem.grid, mask=problem.fixed_mask, settings=settings.discrete
         )
+        if problem.held:
+            start = repair_folds(held_still(start, problem.held), problem.grid)
     if space is not None:
         u, records = optimise_symmetric(space, problem.grid, settings, start, callback)
     else:

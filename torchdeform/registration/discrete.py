@@ -11,7 +11,7 @@ from torchdeform.core.flow import OdeSolver, flow
 from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid
 from torchdeform.core.intensities import require_finite
-from torchdeform.core.resampling import MIN_NODES, hat_average, prolong, pyramid_grids, restrict
+from torchdeform.core.resampling import hat_average, prolong, pyramid_grids, restrict
 from torchdeform.core.warp import compose, warp
 from torchdeform.errors import InputError
 from torchdeform.fem.solver import SolverSettings
@@ -57,7 +57,7 @@ def discrete_start(
         achieves that, positive in any case: the ``start`` of `register`.
 
     Raises:
-        InputError: shapes, values that are not finite, fewer than 8 nodes on an axis, or a search so wide that its
+        InputError: shapes, values that are not finite, or a search so wide that its
             costs exceed 2^29 numbers.
 
     Notes:
@@ -82,8 +82,6 @@ def _check(fixed: Tensor, moving: Tensor, mask: Tensor | None, grid: Grid) -> No
     grid.check(moving, "discrete_start: moving", components=fixed.shape[1])
     if (fixed.shape[0], fixed.dtype, fixed.device) != (moving.shape[0], moving.dtype, moving.device):
         raise InputError("discrete_start: fixed and moving must agree in batch size, dtype and device")
-    if min(grid.shape) < MIN_NODES:
-        raise InputError(f"discrete_start: every axis must have at least {MIN_NODES} voxels, got {grid.shape}")
     require_finite(fixed, moving, "discrete_start")
     if mask is not None and (tuple(mask.shape[1:]) != (1, *grid.shape) or len(mask) not in (1, len(fixed))):
         raise InputError(

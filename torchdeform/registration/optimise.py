@@ -148,6 +148,7 @@ class Level:
         levels: how many there are.
         transfer: between the grid of the images and that of the map, None where they are one.
         keep_best: end at the best map that was met, and stop where nothing is gained; otherwise make all steps.
+        held: axes along which nothing is moved, from 0.
     """
 
     objective: Objective
@@ -158,6 +159,7 @@ class Level:
     levels: int = 1
     transfer: Transfer | None = None
     keep_best: bool = True
+    held: tuple[int, ...] = ()
 
     @property
     def grid(self) -> Grid:
@@ -260,6 +262,7 @@ def make_level(
         index=index,
         levels=levels,
         transfer=Transfer(problem.grid, grid, problem.fixed) if grid != problem.grid else None,
+        held=problem.held,
     )
 
 
@@ -339,7 +342,9 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     load = None if points is None else points.load(grid) * scale
     # 3. Least squares: div and curl of the velocity are paid for, nearly folded places ask for divergence.
     barrier = fold_barrier(state.lowest, settings.folds.soft_determinant)
-    v = normalise_step(objective.coupling.velocity(level.metric.ascent(force, barrier, load)), grid)
+    force, load = held_still(force, level.held), None if load is None else held_still(load, level.held)
+    v = held_still(level.metric.ascent(force, barrier, load), level.held)
+    v = normalise_step(objective.coupling.velocity(v), grid)
     direction = v + settings.optimiser.momentum * state.direction
     v = normalise_step(direction, grid)
     # 4. and 5. Flow and guard: φ ← φ ∘ flow(v), no farther than where a determinant becomes too small.
@@ -350,6 +355,14 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     shortened = state.shortened + int((moved < 1).sum())
     active = state.active & (moved > 0)
     return replace(state, u=u, lowest=lowest, direction=direction, active=active, shortened=shortened), False
+
+
+def held_still(field: Tensor, axes: Sequence[int]) -> Tensor:
+    """Return a vector field ``(B, D, *S)`` without its components along some axes.
+
+    The velocity of a force that has been through this, taken through it again, still leads uphill: P K⁻¹ P ≥ 0.
+    """
+    return field.index_fill(1, torch.tensor(axes, device=field.device), 0.0) if axes else field
 
 
 def fold_free_step(level: Level, state: State, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:

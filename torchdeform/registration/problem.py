@@ -6,15 +6,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdeform.core.grid import Grid
+from torchdeform.core.grid import Grid, over_slabs
 from torchdeform.core.image import Image, require_registrable, resample, same_place
 from torchdeform.core.intensities import corresponding_channels, fill, to_common_scale
-from torchdeform.core.resampling import restrict
+from torchdeform.core.resampling import MIN_NODES, restrict
 from torchdeform.core.transform import Affine
+from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import weighted
 from torchdeform.metrics.similarity import needs_common_scale
 from torchdeform.registration.settings import RegistrationSettings
+
+
+# Slices are far apart where they are so many times farther than the nodes and the pixels.
+_SPARSE = 3.0
+
+# Cosine of the angle with an axis of the grid up to which slices are across that axis.
+_ALONG = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,6 +111,7 @@ class RegistrationProblem:
         moving_mask: likewise.
         fixed_points: ``(B, D, n)`` in grid points, or None.
         moving_points: likewise.
+        held: axes along which nothing is moved, from 0.
     """
 
     grid: Grid
@@ -112,6 +121,7 @@ class RegistrationProblem:
     moving_mask: Tensor | None = None
     fixed_points: Tensor | None = None
     moving_points: Tensor | None = None
+    held: tuple[int, ...] = ()
 
     @property
     def pairs(self) -> tuple[Tensor, Tensor] | None:
@@ -131,7 +141,7 @@ class RegistrationProblem:
         def coarser(field: Tensor | None) -> Tensor | None:
             return None if field is None else restrict(field, self.grid, coarse)
 
-        masks = {"fixed_mask": coarser(self.fixed_mask), "moving_mask": coarser(self.moving_mask)}
+        masks = {name: coarser(getattr(self, name)) for name in ("fixed_mask", "moving_mask")}
         images = {"fixed": restrict(self.fixed, self.grid, coarse), "moving": restrict(self.moving, self.grid, coarse)}
         return replace(self, grid=coarse, **images, **masks)
 
@@ -150,7 +160,7 @@ def problem_of_tensors(fixed: Tensor, moving: Tensor, grid: Grid, annotations: A
     masks = [_weights(mask, fixed) for mask in (annotations.fixed_mask, annotations.moving_mask)]
     images = [image if mask is None else fill(image, mask) for image, mask in zip((fixed, moving), masks, strict=True)]
     points = [None if p is None else p.to(fixed) for p in (annotations.fixed_points, annotations.moving_points)]
-    return RegistrationProblem(grid, *images, *masks, *points)
+    return RegistrationProblem(grid, *images, *masks, *points, held=_thin_axes(grid))
 
 
 def _weights(mask: object, like: Tensor) -> Tensor | None:
@@ -216,15 +226,75 @@ def resample_pair(fixed: PlacedImage, moving: PlacedImage, frame: Image) -> Regi
     """Return the problem of both images sampled on the grid of ``frame``, each where it is in the world.
 
     An image that does not cover the frame has a mask there whether it came with one or not: beyond its edges there is
-    nothing to compare.
+    nothing to compare. Where the slices of one are far apart, the other is compared as such slices would show it, and
+    nothing is moved across them, nor across a few slices: what one would need to see for it is not in the image.
     """
     like = fixed.image.data
     images = [resample(s.image, frame, outside=None).to(like) for s in (fixed, moving)]
+    images = [
+        _through(replace(frame, data=images[0]), moving.image),
+        _through(replace(frame, data=images[1]), fixed.image),
+    ]
     masks = [_mask_on(frame, s) for s in (fixed, moving)]
     points = [None if s.points is None else frame.to_grid(s.points).to(like) for s in (fixed, moving)]
-    return RegistrationProblem(
-        frame.grid, *images, *(None if mask is None else mask.to(like) for mask in masks), *points
-    )
+    weights = [None if mask is None else mask.to(like) for mask in masks]
+    across = [axis for part in (fixed, moving) if (axis := _across(part.image, frame)) is not None]
+    held = tuple(sorted({*_thin_axes(frame.grid), *across}))
+    return RegistrationProblem(frame.grid, *images, *weights, *points, held=held)
+
+
+def _thin_axes(grid: Grid) -> tuple[int, ...]:
+    """Return the axes with few nodes; none where all have few."""
+    thin = tuple(axis for axis, nodes in enumerate(grid.shape) if nodes < MIN_NODES)
+    return thin if len(thin) < grid.dim else ()
+
+
+def _steps(image: Image, frame: Image) -> Tensor:
+    """Return by how many nodes of the frame one moves with each axis of an image, the columns of ``(D, D)``."""
+    ends = torch.diag(torch.tensor(image.grid.spacing, dtype=torch.float64))
+    ends = torch.cat([ends, torch.zeros_like(ends[:, :1])], dim=1).unsqueeze(0)
+    places = frame.to_grid(image.to_world(ends))[0] / torch.tensor(frame.grid.spacing, dtype=torch.float64).unsqueeze(1)
+    return places[:, :-1] - places[:, -1:]
+
+
+def _sparse_axis(steps: Tensor) -> int | None:
+    """Return the axis of an image whose slices are far apart, against nodes of the frame and its other voxel sides."""
+    second, longest = steps.norm(dim=0).sort().values[-2:].tolist()
+    return int(steps.norm(dim=0).argmax()) if longest >= _SPARSE * max(second, 1.0) else None
+
+
+def _across(image: Image, frame: Image) -> int | None:
+    """Return the axis of the frame across slices that are far apart, None without one."""
+    steps = _steps(image, frame)
+    axis = _sparse_axis(steps)
+    if axis is None:
+        return None
+    step = steps[:, axis].abs()
+    return int(step.argmax()) if float(step.max() / step.norm()) > _ALONG else None
+
+
+def _through(seen: Image, image: Image) -> Tensor:
+    """Return an image as another with the slices of ``image`` would show it, if those are far apart; else as it is.
+
+    Notes:
+        Between two slices stands a mixture of both, which looks like neither. To match it with the tissue that is there
+        the map would bend: with slices 5 voxels apart, from an error of 0.2 to one of 0.5 mm.
+    """
+    steps, grid = _steps(image, seen), seen.grid
+    axis = _sparse_axis(steps)
+    if axis is None:
+        return seen.data
+    step = grid.along((steps[:, axis] * torch.tensor(grid.spacing, dtype=torch.float64)).tolist(), seen.data.double())
+
+    def values(rows: slice) -> Tensor:
+        points = grid.points(dtype=torch.float64, device=seen.data.device, rows=rows)
+        number = image.to_grid(seen.to_world(points))[:, axis : axis + 1] / image.grid.spacing[axis]
+        last = image.grid.shape[axis] - 1
+        number, below = number.clamp(0, last), number.floor().clamp(0, last - 1)
+        first, second = (sample(seen.data, points + (k - number) * step, grid) for k in (below, below + 1))
+        return first.lerp(second, (number - below).to(first))
+
+    return over_slabs(values, grid.shape, seen.data.device)
 
 
 def _mask_on(frame: Image, placed: PlacedImage) -> Tensor | None:

@@ -197,7 +197,7 @@ def midspace_frame(fixed: Image, moving: Image, axes: Direction) -> Image:
     low, high = (low.amax(0) - margin).maximum(low.amin(0)), (high.amin(0) + margin).minimum(high.amax(0))
     spacing = torch.stack([_spacing_along(image, origin) for image in (fixed, moving)]).log().mean(0).exp()
     shape = ((high - low) / spacing + 1 + 1e-6).floor()
-    if bool((shape < MIN_NODES).any()):
+    if bool((shape < min(MIN_NODES, *fixed.grid.shape, *moving.grid.shape)).any()):
         raise InputError(f"{fixed.name} and {moving.name} have too little in common; align them first")
     rest = (high - low - (shape - 1) * spacing) / 2
     first = origin.to_world((low + rest).view(1, -1, 1)).flatten().tolist()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchdeform.core.diagnostics import smallest_determinant
 from torchdeform.core.fold_free import largest_share
-from torchdeform.core.grid import per_item
+from torchdeform.core.grid import magnitude, per_item
 from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Transform, place_of
 from torchdeform.core.warp import compose, invert, max_voxels
@@ -342,6 +342,9 @@ def average_intensities(images: Iterable[Image], *, match: bool = True) -> Image
 def _level(data: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
     """Return mean and standard deviation of each channel over the nodes that are known, ``(1, C, 1, ..)`` each."""
     axes, nodes = tuple(range(2, data.dim())), known.sum().clamp(min=1)
-    mean = data.where(known, 0.0).sum(axes, keepdim=True) / nodes
+    data = data.where(known, 0.0)
+    scale = magnitude(data)
+    data = data / scale
+    mean = data.sum(axes, keepdim=True) / nodes
     variance = (data - mean).where(known, 0.0).square().sum(axes, keepdim=True) / nodes
-    return mean, variance.sqrt().clamp(min=torch.finfo(data.dtype).tiny)
+    return mean * scale, (variance.sqrt() * scale).clamp(min=torch.finfo(data.dtype).tiny)

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
+from torch.autograd import Function
 
 
 class Status(Enum):
@@ -44,6 +46,37 @@ class Solution:
     def ok(self) -> bool:
         """True when every item converged."""
         return all(s.ok for s in self.status)
+
+
+class Box:
+    """What a `Function` has to say besides its result; of lists and tuples `torch.func` would hand on copies."""
+
+    content: Any = None
+
+
+class _Listed(Function):
+    """Whole numbers as a list; of items that `torch.func.vmap` runs over the largest."""
+
+    @staticmethod
+    def forward(codes: Tensor, found: Box) -> Tensor:
+        found.content = codes.tolist()
+        return codes.clone()
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        pass
+
+    @staticmethod
+    def vmap(info, in_dims, codes: Tensor, found: Box):
+        return _Listed.apply(codes.amax(in_dims[0]), found), None
+
+
+@torch.no_grad()
+def listed(codes: Tensor) -> list[int]:
+    """Return whole numbers ``(B,)`` as a list; where `torch.func.vmap` hides many of each, the largest of them."""
+    found = Box()
+    _Listed.apply(codes, found)
+    return found.content
 
 
 class System(Protocol):

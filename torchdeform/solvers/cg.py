@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from torchdeform.core.grid import per_item
+from torchdeform.core.grid import largest, magnitude, per_item
+from torchdeform.core.tables import in_transformation
 from torchdeform.errors import ComputationError, InputError
-from torchdeform.solvers.base import Factor, Solution, Status, System
+from torchdeform.solvers.base import Box, Factor, Solution, Status, System
 
 # ‖r‖ ≤ rtol ‖b‖ is asked for when nothing else is said.
 DEFAULT_RTOL = {torch.float32: 1e-5, torch.float64: 1e-10}
@@ -72,9 +73,9 @@ def conjugate_gradient(
     _check(b, x0, rtol, atol, max_steps)
     rtol = DEFAULT_RTOL[b.dtype] if rtol is None else rtol
     settings = _Settings(preconditioner, rtol, atol, max_steps, watch=torch.is_grad_enabled())
-    report: list[Solution] = []
+    report = Box()
     value = _Implicit.apply(operator.apply, settings, x0, report, b, *operator.parameters)
-    return replace(report[0], value=value)
+    return replace(report.content, value=value)
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,8 @@ class ConjugateGradient:
         if self.preconditioner is not None:
             with torch.no_grad():
                 precondition = self.preconditioner(system, like)
-        product = _matrix_product(system, like) if self.assembled else system.apply
+        assembled = self.assembled and not in_transformation()  # which knows no sparse matrices
+        product = _matrix_product(system, like) if assembled else system.apply
         return ConjugateGradientFactor(self, system, product, precondition)
 
 
@@ -188,8 +190,8 @@ class _Settings:
 
 
 def _check(b: Tensor, x0: Tensor | None, rtol: float | None, atol: float, max_steps: int) -> None:
-    if not isinstance(b, Tensor) or b.dtype not in DEFAULT_RTOL or b.dim() < 2:
-        raise InputError("conjugate_gradient: b must be a float32 or float64 tensor (B, ...)")
+    if not isinstance(b, Tensor) or b.dtype not in DEFAULT_RTOL or b.dim() < 2 or b.numel() == 0:
+        raise InputError("conjugate_gradient: b must be a float32 or float64 tensor (B, ...) that is not empty")
     if x0 is not None and (x0.shape, x0.dtype, x0.device) != (b.shape, b.dtype, b.device):
         raise InputError(f"conjugate_gradient: x0 must be like b, {tuple(b.shape)} of {b.dtype} on {b.device}")
     if atol < 0 or (rtol is not None and rtol < 0) or max_steps < 0:
@@ -200,21 +202,37 @@ class _Implicit(Function):
     """x = A(θ)⁻¹ b. From A dx = db − dA x and A = Aᵀ, a cotangent g of x is λ = A⁻¹ g for b and −λᵀ (∂A/∂θ) x for θ."""
 
     @staticmethod
-    def forward(
-        ctx, apply, settings: _Settings, x0: Tensor | None, report: list[Solution], b: Tensor, *parameters: Tensor
-    ):
-        ctx.product, ctx.settings = apply, settings
+    def forward(apply, settings: _Settings, x0: Tensor | None, report: Box, b: Tensor, *parameters: Tensor):
         operator = Operator(apply, tuple(p.detach() for p in parameters))
-        report.append(_solve(operator, b.detach(), x0, settings))
-        ctx.save_for_backward(report[0].value, *parameters)
-        return report[0].value
+        report.content = _solve(operator, b.detach(), x0, settings)
+        return report.content.value
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.product, ctx.settings, _, _, _, *parameters = inputs
+        ctx.save_for_backward(output, *parameters)
+
+    @staticmethod
+    def vmap(info, in_dims, apply, settings, x0, report: Box, *tensors: Tensor):
+        """Solve for one after the other: a batch of conjugate gradients is no faster on small systems."""
+        found: list[Solution] = []
+        for k in range(info.batch_size):
+            first, *others = (
+                t if dim is None else t.select(dim, k)
+                for t, dim in zip((x0, *tensors), (in_dims[2], *in_dims[4:]), strict=True)
+            )
+            own = Box()
+            value = _Implicit.apply(apply, settings, first, own, *others)
+            found.append(replace(own.content, value=value))
+        report.content = _worst(found)
+        return torch.stack([solution.value for solution in found]), 0
 
     @staticmethod
     def backward(ctx, *grads: Tensor):
         x, *parameters = ctx.saved_tensors
-        report: list[Solution] = []
+        report = Box()
         adjoint = _Implicit.apply(ctx.product, replace(ctx.settings, atol=0.0), None, report, grads[0], *parameters)
-        if why := {s.value for s in report[0].status if s in (Status.MAX_STEPS, Status.BREAKDOWN)}:
+        if why := {s.value for s in report.content.status if s in (Status.MAX_STEPS, Status.BREAKDOWN)}:
             text = f"conjugate_gradient, solving for a gradient: {'; '.join(sorted(why))}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)
         gradients = _parameter_gradients(ctx.product, x, parameters, ctx.needs_input_grad[5:], adjoint)
@@ -227,16 +245,23 @@ def _parameter_gradients(
     """Return −λᵀ (∂A/∂θ) x for each wanted θ, with a graph where a further derivative may follow."""
     if not any(wanted):
         return [None] * len(parameters)
-    further = torch.is_grad_enabled()
-    with torch.enable_grad():
-        # Fresh aliases keep the derivative from running on into what the parameters, or x, were made of.
-        aliases = [
-            p.view_as(p) if further else p.detach().requires_grad_(w) for p, w in zip(parameters, wanted, strict=True)
-        ]
-        product = apply(x if further else x.detach(), *aliases)
-        chosen = [a for a, w in zip(aliases, wanted, strict=True) if w]
-        found = iter(torch.autograd.grad(product, chosen, -adjoint, create_graph=further, allow_unused=True))
+
+    def product(*chosen: Tensor) -> Tensor:
+        rest = iter(chosen)
+        return apply(x, *(next(rest) if w else p for p, w in zip(parameters, wanted, strict=True)))
+
+    _, pull = torch.func.vjp(product, *(p for p, w in zip(parameters, wanted, strict=True) if w))
+    found = iter(pull(-adjoint))
     return [next(found) if w else None for w in wanted]
+
+
+def _worst(found: list[Solution]) -> Solution:
+    """Return of solutions of the same items the first status that is not fine, the most steps, the largest residual."""
+    status = tuple(
+        next((s for s in several if not s.ok), several[0]) for several in zip(*(s.status for s in found), strict=True)
+    )
+    steps, residual = (torch.stack([getattr(s, name) for s in found]).amax(0) for name in ("steps", "residual"))
+    return Solution(found[0].value, status, steps, residual)
 
 
 # What has become of an item; the others are still under way.
@@ -262,10 +287,11 @@ def _solve(operator: Operator, b: Tensor, x0: Tensor | None, settings: _Settings
         if not bool((again & (steps < settings.max_steps)).any()):
             break
         before = left
-    code = torch.where(finite, code, _NON_FINITE)
-    lost = code == _NON_FINITE
+    x = x * scale
+    lost = ~finite | (code == _NON_FINITE) | ~torch.isfinite(largest(x))
+    code = torch.where(lost, _NON_FINITE, code)
     residual = torch.where(lost, torch.nan, torch.where(norm > 0, left / norm, 0))
-    value = torch.where(per_item(lost, x), torch.nan, x * scale)
+    value = torch.where(per_item(lost, x), torch.nan, x)
     return Solution(value, tuple(_STATUS[c] for c in code.tolist()), steps, residual)
 
 
@@ -288,12 +314,10 @@ def _scaled(b: Tensor, x0: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tenso
     if x0 is not None:
         finite &= torch.isfinite(x0).flatten(1).all(1)
     b = torch.where(per_item(finite, b), b, 0)
-    largest = b.abs().flatten(1).amax(1)
-    scale = per_item(torch.ldexp(torch.ones_like(largest), torch.frexp(largest).exponent), b)
-    start = (
-        torch.zeros_like(b) if x0 is None else torch.where(per_item(finite & (largest > 0), b), x0.detach(), 0) / scale
-    )
-    return b / scale, start, finite, scale
+    scale = magnitude(b)
+    if x0 is None:
+        return b / scale, torch.zeros_like(b), finite, scale
+    return b / scale, torch.where(per_item(finite & (largest(b) > 0), b), x0.detach(), 0) / scale, finite, scale
 
 
 def _descend(

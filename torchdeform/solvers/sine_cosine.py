@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
+from torchdeform.core.grid import over_items
 from torchdeform.core.tables import kept
 from torchdeform.errors import require_choice
 
@@ -87,13 +88,24 @@ def separable_transform(x: Tensor, kinds: Kinds, *, out: Tensor | None = None) -
 
 class _SeparableTransform(Function):
     @staticmethod
-    def forward(ctx, x: Tensor, kinds: Kinds) -> Tensor:
-        ctx.kinds = kinds
+    def forward(x: Tensor, kinds: Kinds) -> Tensor:
         return _separable(x, kinds, torch.empty_like(x, memory_format=torch.contiguous_format))
+
+    @staticmethod
+    def setup_context(ctx, inputs, output) -> None:
+        ctx.kinds = inputs[1]
 
     @staticmethod
     def backward(ctx, grad: Tensor):
         return _SeparableTransform.apply(grad, ctx.kinds), None
+
+    @staticmethod
+    def jvp(ctx, tangent: Tensor, _: None) -> Tensor:
+        return _SeparableTransform.apply(tangent, ctx.kinds)
+
+    @staticmethod
+    def vmap(info, in_dims, x: Tensor, kinds: Kinds):
+        return over_items(lambda items: _SeparableTransform.apply(items, kinds), x, in_dims[0]), 0
 
 
 def _separable(x: Tensor, kinds: Kinds, out: Tensor) -> Tensor:

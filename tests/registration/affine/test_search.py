@@ -28,7 +28,7 @@ def test_principal_axes_give_the_rotation_of_an_elongated_body(dim):
         lengths = place.grid.along((10.0, 6.0, 3.0)[:dim], own)
         parts.append(MaskedImage(place, torch.exp(-(own / lengths).square().sum(1, keepdim=True))))
     frame = NormalisedFrame.of(parts[0].image)
-    starts = make_starts(image_moments(parts[0], frame), image_moments(parts[1], frame), turn=True, scale=False)
+    starts = make_starts(image_moments(parts[0], frame), image_moments(parts[1], frame), turn=True)
     axes = [s.map[:dim, :dim] for s in starts if s.name.startswith("moments")]
     assert len(axes) == 2 ** (dim - 1)
     assert min(float(angle(a @ turn(dim, -50))) for a in axes) < 5

@@ -15,6 +15,7 @@ from torchdeform.core.transform import Affine
 from torchdeform.errors import ComputationError, InputError, require_choice
 from torchdeform.metrics.correlation import ForegroundLNCC
 from torchdeform.metrics.similarity import Similarity, features, make_similarity, needs_common_scale, similarity_weights
+from torchdeform.registration.affine.guesses import Guess, guessed
 from torchdeform.registration.affine.lie import generators
 from torchdeform.registration.affine.objective import AffineObjective, MaskedImage, NormalisedFrame
 from torchdeform.registration.affine.search import Candidate, SearchResult, optimised, search
@@ -47,7 +48,8 @@ class Alignment:
     Attributes:
         affine: φ from points of the fixed world to the moving world; warped(x) = moving(φ(x)). Its determinant is
             positive.
-        similarity_before: similarity in the files' own geometry, on the finest level; None without overlap.
+        similarity_before: similarity in the files' own geometry, on the finest level; None without overlap, and where
+            things are of another size than the files say.
         similarity_after: similarity through the map, higher is better; None without overlap, which only kind ``none``
             leaves.
         start: name of the start from which it was found.
@@ -96,7 +98,8 @@ def align(
         Starts are the files' geometry, the centres of the boxes, the centres of mass and the principal axes, each with
         rotations all around (36 in 2D, the 60 of the icosahedron in 3D), on a grid of some 4000 nodes. The best are
         optimised by BFGS on the group of maps, coarse to fine. The files' geometry is tried again on the second level,
-        and is the result if nothing is more similar. The map depends on the world positions of the voxels, not on the
+        and is the result if nothing is more similar. Where fields of view or voxels differ much in size, several sizes
+        are tried, see `guessed`, and all places of the smaller image in the larger one. The map depends on the world positions of the voxels, not on the
         order of the axes in the file. Determinants are positive: maps are rotations times exponentials.
         Runs on the images' device, in float32; not differentiable, but `Transform.image` is, in the map and the pixels.
     """
@@ -104,28 +107,54 @@ def align(
     kind = settings.kind if kind is None else kind
     require_choice(kind, ALIGNMENTS, "align: kind")
     pair = _prepared((fixed, fixed_mask), (moving, moving_mask), settings)
-    frame = NormalisedFrame.of(pair[0].image)
-    objectives, found = _make_objectives(*pair, frame, settings), SearchResult([])
-    if kind != "none":
-        turn = settings.rotations and kind != "translation"
-        found = search(objectives[0], kind, turn=turn, steps=settings.steps)
-        if abs(math.log(found.size)) > math.log(_SAME_SIZE):
-            objectives = _make_objectives(*pair, frame, settings, found.size)
+    guesses = [Guess(*pair)] if kind == "none" else guessed(*pair, scale=kind in ("similarity", "affine"))
+    trials = [_try(guess, kind, settings) for guess in guesses]
+    trial = max(trials, key=lambda trial: trial.found.value)
+    objectives, frame = trial.objectives(settings), trial.frame
     identity = torch.eye(fixed.grid.dim + 1, dtype=torch.float64, device="cpu")
     before = Candidate("geometry", identity, float(objectives[-1].values(identity.unsqueeze(0))[0]))
     best = before
     if kind != "none":
-        after = _optimise_levels(objectives, [*found.candidates, before], kind, settings)
+        after = _optimise_levels(objectives, [*trial.found.candidates, before], kind, settings)
         best = after if after.value > before.value else before
+    affine = Affine(*frame.to_affine(best.map))
     return Alignment(
-        Affine(*frame.to_affine(best.map)),
+        affine.inverse() if trial.guess.swapped else affine,
         _finite(before.value),
         _finite(best.value),
         best.name,
         perf_counter() - began,
-        _warnings(objectives[-1], best, found, (fixed.name, moving.name)),
-        found.mirror,
+        _warnings(objectives[-1], best, trial, (fixed.name, moving.name)),
+        trial.found.mirror,
     )
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """What the coarse search found where things are as large as a guess says."""
+
+    guess: Guess
+    frame: NormalisedFrame
+    levels: list[tuple[MaskedImage, MaskedImage]]
+    found: SearchResult = SearchResult([])
+
+    def objectives(self, settings: AlignmentSettings) -> list[AffineObjective]:
+        """Return those of all levels, coarse to fine, both images blurred alike by the best map."""
+        levels, known = self.levels, self.guess.size or 1.0
+        if abs(math.log(self.found.size / known)) > math.log(_SAME_SIZE):
+            levels = _pyramid(self.guess, settings, self.found.size)
+        return [_make_objective(level, self.frame, self.guess, settings) for level in levels]
+
+
+def _try(guess: Guess, kind: str, settings: AlignmentSettings) -> _Trial:
+    """Return the best maps of the coarsest level, nothing being searched for ``none``."""
+    trial = _Trial(guess, NormalisedFrame.of(guess.fixed.image), _pyramid(guess, settings, guess.size or 1.0))
+    if kind == "none":
+        return trial
+    objective = _make_objective(trial.levels[0], trial.frame, guess, settings)
+    turn = settings.rotations and kind != "translation"
+    found = search(objective, kind, turn=turn, steps=settings.steps, size=guess.size, part=guess.part)
+    return replace(trial, found=found)
 
 
 def _optimise_levels(
@@ -154,18 +183,18 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _warnings(
-    objective: AffineObjective, best: Candidate, found: SearchResult, names: tuple[str, str]
-) -> tuple[str, ...]:
+def _warnings(objective: AffineObjective, best: Candidate, trial: _Trial, names: tuple[str, str]) -> tuple[str, ...]:
     """Return sentences about a mirror image, a change of size, little overlap."""
     fixed, moving = names
     sentences = []
-    if found.mirrored:
+    if trial.found.mirrored:
         sentences.append(
             f"{moving} looks like a mirror image of {fixed}: mirrored it would fit clearly better; check the "
             "directions in both headers, or flip it and align again"
         )
     longest, *_, shortest = torch.linalg.svdvals(best.map[:-1, :-1]).tolist()
+    if trial.guess.swapped:
+        longest, shortest = 1 / shortest, 1 / longest
     if shortest < _LENGTH_FACTORS[0] or longest > _LENGTH_FACTORS[1]:
         sentences.append(
             f"the alignment changes lengths by factors from {shortest:.2g} to {longest:.2g}; "
@@ -209,28 +238,27 @@ def _masked(image: Image, mask: Image | None) -> MaskedImage:
     return MaskedImage(image, inside.to(image.data))
 
 
-def _make_objectives(
-    fixed: MaskedImage, moving: MaskedImage, frame: NormalisedFrame, settings: AlignmentSettings, size: float = 1.0
-) -> list[AffineObjective]:
-    """Return the objectives of the levels, coarse to fine; voxels are twice as wide as those of the next level.
+def _pyramid(guess: Guess, settings: AlignmentSettings, size: float) -> list[tuple[MaskedImage, MaskedImage]]:
+    """Return both images on the levels, coarse to fine; voxels are twice as wide as those of the next level.
 
     ``size`` is how much larger things are in the moving image: its voxels are larger by as much, to blur both alike.
     """
+    fixed, moving = guess.fixed, guess.moving
     voxel = min(fixed.image.grid.spacing)
     while math.prod(with_spacing(fixed.image.grid, voxel).shape) > settings.nodes_in(fixed.image.grid.dim):
         voxel *= _COARSER
-    objectives = []
+    levels = []
     while True:
         fixed, moving = fixed.coarser(voxel), moving.coarser(voxel * size)
-        objectives.insert(0, _make_objective(fixed, moving, frame, settings))
+        levels.insert(0, (fixed, moving))
         voxel *= 2
         shape = fixed.image.grid.shape
         if math.prod(shape) <= COARSEST_NODES or with_spacing(fixed.image.grid, voxel).shape == shape:
-            return objectives
+            return levels
 
 
 def _make_objective(
-    fixed: MaskedImage, moving: MaskedImage, frame: NormalisedFrame, settings: AlignmentSettings
+    level: tuple[MaskedImage, MaskedImage], frame: NormalisedFrame, guess: Guess, settings: AlignmentSettings
 ) -> AffineObjective:
     """Return the objective of two images at one resolution."""
 
@@ -242,4 +270,5 @@ def _make_objective(
             return ForegroundLNCC(image, settings.window_in(grid.dim))
         return make_similarity(settings.similarity, image, settings.window_in(grid.dim), grid=grid)
 
-    return AffineObjective(compared(fixed), compared(moving), frame, make, settings.min_overlap)
+    fixed, moving = map(compared, level)
+    return AffineObjective(fixed, moving, frame, make, settings.min_overlap, guess.sizes)

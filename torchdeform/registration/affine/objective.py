@@ -1,5 +1,6 @@
 """The objective of an alignment: the similarity of two images at one resolution as a function of the map."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -100,6 +101,7 @@ class AffineObjective:
         frame: coordinates of the maps.
         make: returns the similarity to a fixed image ``(B, C, *S)`` on its grid.
         min_overlap: with less overlap the similarity is −∞, 0 to 1.
+        sizes: smallest and largest factor of length; beyond them it is −∞ too.
 
     Notes:
         A map is a matrix ``(D + 1, D + 1)`` on [q; 1], float64 on the CPU. Weights are taken for constants in the
@@ -113,8 +115,10 @@ class AffineObjective:
         frame: NormalisedFrame,
         make: Callable[[Tensor, Grid], Similarity],
         min_overlap: float,
+        sizes: tuple[float, float] = (0.0, math.inf),
     ) -> None:
         self.fixed, self.moving, self.frame, self.min_overlap = fixed, moving, frame, min_overlap
+        self._volumes = tuple(size**fixed.image.grid.dim for size in sizes)
         grid = fixed.image.grid
         world = fixed.image.to_world(grid.points(dtype=torch.float64)).flatten(2)
         self.points = _with_ones(frame.from_world(world)[0]).to(fixed.image.data)
@@ -180,13 +184,15 @@ class AffineObjective:
         return self._made[items]
 
     def _with_overlap(self, maps: Tensor, value: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-        """Return S, −∞ without enough overlap, and the overlap: 1 when the smaller image lies wholly in the other."""
+        """Return S, −∞ for what cannot be, and the overlap: 1 when the smaller image lies wholly in the other."""
         grids = self.fixed.image.grid, self.moving.image.grid
         weights = [1.0 if m.weight is None else float(m.weight.mean()) for m in (self.fixed, self.moving)]
         volume = torch.linalg.det(maps[:, :-1, :-1]).abs()
         most = (weights[1] * grids[1].volume / grids[0].volume / volume).clamp(max=weights[0])
         overlap = weight.flatten(1).double().mean(1).cpu() / most
-        return torch.where(overlap < self.min_overlap, -torch.inf, value.double().cpu()), overlap
+        small, large = self._volumes
+        wrong = (overlap < self.min_overlap) | (volume < small) | (volume > large)
+        return torch.where(wrong, -torch.inf, value.double().cpu()), overlap
 
     def _warped(self, maps: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the matrices [q; 1] -> grid, moving at the mapped nodes, its slopes along its axes, and the weight."""

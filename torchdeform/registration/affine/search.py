@@ -1,6 +1,7 @@
 """The coarse search of an alignment: many starts are tried, the best are optimised, mirror images are compared."""
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -8,16 +9,21 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.grid import limit_threads
-from torchdeform.core.image import background, centre_of_mass
+from torchdeform.core.image import background, box_corners, centre_of_mass
 from torchdeform.registration.affine.bfgs import maximise
 from torchdeform.registration.affine.lie import angle, generators, homogeneous, rotations
 from torchdeform.registration.affine.objective import AffineObjective, MaskedImage, NormalisedFrame
+from torchdeform.registration.affine.parts import part_places
 
 # Starts that are optimised, mirrored ones among them, and those that go on to the next level.
 _OPTIMISED, _MIRRORED, _KEPT = 10, 3, 3
 
-# Maps nearer to each other than this (norm of the difference of their matrices) count as one.
+# Maps nearer to each other than this (norm of the difference of their matrices over their scale) count as one.
 _SAME_START, _SAME_END = 0.3, 0.05
+
+# Places in the moving image that are tried for a fixed image that shows a part of it: without rotations, with each of
+# them, and all together.
+_PLACES, _PLACES_TURNED, _PARTS = 8, 3, 40
 
 # Shortest step in voxels here; the maps are optimised again.
 _SHORTEST = 0.05
@@ -62,17 +68,31 @@ class SearchResult:
     mirror: float = 0.0
 
     @property
+    def value(self) -> float:
+        """Similarity of the best map, less what does not overlap; −∞ without one."""
+        return self.candidates[0].value if self.candidates else -math.inf
+
+    @property
     def size(self) -> float:
         """How much larger things are in the moving image, by the best map; 1 without one."""
-        if not self.candidates:
-            return 1.0
-        linear = self.candidates[0].map[:-1, :-1]
-        return float(torch.linalg.det(linear)) ** (1 / len(linear))
+        return size_of(self.candidates[0].map) if self.candidates else 1.0
 
     @property
     def mirrored(self) -> bool:
         """Whether a mirrored map is clearly better."""
         return self.mirror > _MIRROR_GAIN
+
+
+def size_of(matrix: Tensor) -> float:
+    """Return the factor by which a map ``(D + 1, D + 1)`` changes lengths on average, |det|^(1/D)."""
+    return float(torch.linalg.det(matrix[:-1, :-1]).abs()) ** (1 / (len(matrix) - 1))
+
+
+def _apart(maps: Tensor) -> Tensor:
+    """Return the norms ``(n, n)`` of the differences of maps over their scale, which makes them shares of the image."""
+    size = torch.linalg.det(maps[:, :-1, :-1]).abs() ** (1 / (maps.shape[1] - 1))
+    difference = (maps.unsqueeze(0) - maps.unsqueeze(1)).flatten(2).norm(dim=2)
+    return difference / (size.unsqueeze(0) * size.unsqueeze(1)).sqrt()
 
 
 def optimised(
@@ -86,7 +106,9 @@ def optimised(
     return sorted(moved, key=lambda c: -c.value)
 
 
-def search(objective: AffineObjective, kind: str, *, turn: bool, steps: int) -> SearchResult:
+def search(
+    objective: AffineObjective, kind: str, *, turn: bool, steps: int, size: float | None = None, part: bool = False
+) -> SearchResult:
     """Return the best maps found from the files' geometry, the centres, the moments, and rotations of them.
 
     Args:
@@ -94,6 +116,8 @@ def search(objective: AffineObjective, kind: str, *, turn: bool, steps: int) -> 
         kind: ``translation`` to ``affine``; ``affine`` is searched as ``similarity``.
         turn: try rotations, and mirror images.
         steps: evaluations at most.
+        size: how much larger things are in the moving image; None for as large, and for what the moments say.
+        part: whether the fixed image may show a part of the moving one.
 
     Notes:
         Maps are ranked by their merit (S − median of S over all starts) · overlap: what is common to bad maps does not
@@ -102,11 +126,14 @@ def search(objective: AffineObjective, kind: str, *, turn: bool, steps: int) -> 
     """
     rough = "similarity" if kind == "affine" else kind
     moments = [image_moments(part, objective.frame) for part in (objective.fixed, objective.moving)]
-    starts = make_starts(*moments, turn=turn, scale=rough == "similarity")
+    sizes = _sizes(*moments, scale=rough == "similarity") if size is None else [size]
+    starts = make_starts(*moments, turn=turn, sizes=sizes)
+    if part:
+        starts += part_starts(objective, sizes[0], turn=turn)
     found, median = _try(objective, starts, rough, steps, _OPTIMISED)
     if not turn or not found:
         return SearchResult(_best(found, median))
-    flipped = make_starts(*moments, turn=True, scale=rough == "similarity", mirror=True)
+    flipped = make_starts(*moments, turn=True, sizes=sizes, mirror=True)
     mirrored, _ = _try(objective, flipped, rough, steps, _MIRRORED)
     merit, rival = (max((c.value - median for c in some), default=0.0) for some in (found, mirrored))
     return SearchResult(_best(found, median), rival / max(merit, 1e-12))
@@ -133,9 +160,9 @@ def _try(
 def _promising(starts: list[Candidate], maps: Tensor, merit: Tensor, most: int) -> list[int]:
     """Return the starts to optimise: all without a rotation, then the best of the others that are not alike."""
     chosen = [i for i, start in enumerate(starts) if not start.turned and merit[i] > -torch.inf]
+    alike = _apart(maps) < _SAME_START
     for i in merit.argsort(descending=True, stable=True).tolist():
-        alone = all(float((maps[i] - maps[j]).norm()) >= _SAME_START for j in chosen)
-        if alone and merit[i] > -torch.inf and len(chosen) < most:
+        if not bool(alike[i, chosen].any()) and merit[i] > -torch.inf and len(chosen) < most:
             chosen.append(i)
     return chosen
 
@@ -147,12 +174,34 @@ def _best(candidates: list[Candidate], median: float) -> list[Candidate]:
         gain = candidate.value - median
         return gain / _TURNED_GAIN if float(angle(candidate.map[:-1, :-1])) > _TURNED else gain
 
-    kept: list[Candidate] = []
-    for candidate in sorted(candidates, key=merit, reverse=True):
-        alone = all(float((candidate.map - other.map).norm()) >= _SAME_END for other in kept)
-        if alone and candidate.value > -torch.inf and len(kept) < _KEPT:
-            kept.append(candidate)
-    return kept
+    ranked = sorted((c for c in candidates if c.value > -torch.inf), key=merit, reverse=True)
+    if not ranked:
+        return []
+    alike, kept = _apart(torch.stack([candidate.map for candidate in ranked])) < _SAME_END, []
+    for i in range(len(ranked)):
+        if not bool(alike[i, kept].any()) and len(kept) < _KEPT:
+            kept.append(i)
+    return [ranked[i] for i in kept]
+
+
+def part_starts(objective: AffineObjective, size: float, *, turn: bool) -> list[Candidate]:
+    """Return maps that take the fixed image to a part of the moving one, the best places for each rotation.
+
+    Args:
+        objective: of the coarsest level.
+        size: how much larger things are in the moving image.
+        turn: try rotations all around, in 2D; there are too many nodes for it in 3D.
+    """
+    frame, fixed, moving = objective.frame, objective.fixed, objective.moving
+    turns = rotations(objective.dim)[: None if turn and objective.dim == 2 else 1]
+    centre = fixed.image.to_world(box_corners(fixed.image.grid))[0].mean(1)
+    start, found = frame.from_world(centre.view(1, -1, 1)).flatten(), []
+    for r in turns:
+        for fit, place in part_places(fixed, moving, size * r, _PLACES if len(turns) == 1 else _PLACES_TURNED):
+            end = frame.from_world(place.view(1, -1, 1)).flatten()
+            found.append((fit, replace(_about("part", size * r, start, end), turned=True)))
+    best = sorted(found, key=lambda pair: -pair[0])[:_PARTS]
+    return [candidate for _, candidate in best]
 
 
 @dataclass(frozen=True)
@@ -188,18 +237,29 @@ def image_moments(part: MaskedImage, frame: NormalisedFrame) -> Moments:
     return Moments(mass.squeeze(1), covariance, (points[:, 0] + points[:, -1]) / 2)
 
 
-def make_starts(fixed: Moments, moving: Moments, *, turn: bool, scale: bool, mirror: bool = False) -> list[Candidate]:
+def _sizes(fixed: Moments, moving: Moments, *, scale: bool) -> list[float]:
+    """Return how much larger things may be in the moving image: as large, or as the spread of the contents says."""
+    ratio = contents_ratio(fixed, moving)
+    return [1.0, ratio] if scale and max(ratio, 1 / ratio) > _SAME_SIZE else [1.0]
+
+
+def contents_ratio(fixed: Moments, moving: Moments) -> float:
+    """Return how much wider the content of the moving image spreads."""
+    return float((moving.covariance.trace() / fixed.covariance.trace()).sqrt())
+
+
+def make_starts(
+    fixed: Moments, moving: Moments, *, turn: bool, sizes: Sequence[float] = (1.0,), mirror: bool = False
+) -> list[Candidate]:
     """Return the maps to try, those without a rotation first.
 
     Args:
         fixed: moments of the fixed image.
         moving: moments of the moving image, in the same frame.
         turn: try rotations about each centre, and the principal axes.
-        scale: try the ratio of sizes.
+        sizes: how much larger things may be in the moving image.
         mirror: return mirror images of the same maps, which no alignment may end at.
     """
-    ratio = float((moving.covariance.trace() / fixed.covariance.trace()).sqrt())
-    sizes = [1.0, ratio] if scale and max(ratio, 1 / ratio) > _SAME_SIZE else [1.0]
     anchors = {
         "geometry": (fixed.box, fixed.box),
         "centres": (fixed.box, moving.box),
@@ -212,7 +272,7 @@ def make_starts(fixed: Moments, moving: Moments, *, turn: bool, scale: bool, mir
     for (name, (start, end)), size, r in itertools.product(anchors.items(), sizes, turns):
         found.append(_about(name, size * r * flip, start, end))
     if turn:
-        found += [_about("moments", r * flip, fixed.mass, moving.mass) for r in _axes(fixed, moving)]
+        found += [_about("moments", sizes[0] * r * flip, fixed.mass, moving.mass) for r in _axes(fixed, moving)]
     return sorted(found, key=lambda s: s.turned)
 
 
