@@ -160,6 +160,21 @@ def test_a_pair_is_the_same_from_wherever_it_is_named(folder, engine, monkeypatc
     assert main(["../fixed.png", str(folder / "moving.png"), "--out", "../out", "--preset", "fast", "--quiet"]) == 0
 
 
+@pytest.mark.parametrize("versions", [{}, {"versions": {"torchdeform": "0.1.0"}}, {"versions": [1]}, {"files": None}])
+def test_only_what_register_writes_is_ever_removed(folder, engine, versions):
+    """Whatever a record in the folder lists, also one that looks like ours."""
+    (folder / "out").mkdir()
+    mine = ["thesis.docx", "warped.notes.old.txt", "moving.png", "sub", "warped"]
+    for name in mine:
+        (folder / "out" / name).touch()
+    inputs = {side: str(folder / f"{side}.png") for side in ("fixed", "moving")}
+    listed = [*mine, "../fixed.png", "/etc/hostname", "..", ".", "a\0b", 3, None, "result.json"]
+    (folder / "out" / "result.json").write_text(json.dumps({"inputs": inputs, "files": listed} | versions))
+    assert main(["fixed.png", "moving.png", "--out", "out", "--quiet"]) == 0
+    assert all((folder / "out" / name).exists() for name in mine)
+    assert (folder / "fixed.png").is_file()
+
+
 def test_results_of_another_command_are_kept(folder, engine, capsys):
     assert torchdeform(["grid", "fixed.png", "--out", "out", "--quiet"]) == 0
     assert "out has the results of another command" in _fails(capsys, 2, "fixed.png", "moving.png", "--out", "out")

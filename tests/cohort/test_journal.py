@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk
+from dicom_files import single, volume
 from nested_settings import changed
 
 from torchdeform.cohort.journal import JOURNAL, Journal, Record, open_lines
@@ -229,14 +230,15 @@ def test_pixels_in_a_file_of_their_own_count(tmp_path, job, header, data):
     assert fingerprint(tmp_path, detached) != before
 
 
-@pytest.mark.parametrize("given", ["series", "series/1.dcm"])
+@pytest.mark.parametrize("given", ["folder", "file"])
 def test_every_slice_of_a_series_counts(tmp_path, job, given):
-    (tmp_path / "series").mkdir()
-    for name in ("1.dcm", "2.dcm"):
-        (tmp_path / "series" / name).write_bytes(b"\0" * 128 + b"DICM")
-    of_series = replace(job, files=replace(job.files, fixed=tmp_path / given))
+    series = single(tmp_path / "series", volume())
+    files = sorted(series.iterdir())
+    of_series = replace(job, files=replace(job.files, fixed=series if given == "folder" else files[0]))
     before = fingerprint(tmp_path, of_series)
-    (tmp_path / "series" / "2.dcm").write_bytes(b"\0" * 128 + b"DICM2")
+    content = bytearray(files[-1].read_bytes())
+    content[-2] ^= 1  # a bit of a pixel
+    files[-1].write_bytes(content)
     assert fingerprint(tmp_path, of_series) != before
 
 

@@ -1,5 +1,6 @@
 """One pair in its process: what it says goes to its log, and a failure is a report like any other."""
 
+import errno
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,6 +9,7 @@ import pytest
 
 from torchdeform.cohort import task as module
 from torchdeform.cohort.task import DONE, FAILED, PairReport, Task, perform
+from torchdeform.errors import MachineError
 
 
 @pytest.fixture
@@ -60,3 +62,15 @@ def test_an_error_that_nobody_foresaw_leaves_its_traceback_in_the_log(do, jobs, 
     monkeypatch.setattr(module, "register_job", fail)
     assert "ZeroDivisionError" in do(Task(jobs[0], tmp_path / "a.log")).sentence
     assert "Traceback" in (tmp_path / "a.log").read_text(encoding="utf-8")
+
+
+def test_a_failure_of_the_machine_is_no_report_about_the_pair(do, jobs, tmp_path, monkeypatch):
+    def fail(job: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "/out/a")
+
+    monkeypatch.setattr(module, "register_job", fail)
+    with pytest.raises(MachineError, match="/out/a: No space left on device"):
+        do(Task(jobs[0], tmp_path / "a.log"))
+    monkeypatch.setattr(module, "_log_job", lambda _: fail(None))
+    with pytest.raises(MachineError):
+        do(Task(jobs[0], tmp_path / "b.log"))

@@ -30,7 +30,7 @@ class _Stream(io.FileIO):
                 select.select([], [self], [])
         except OSError as error:
             if stat.S_ISREG(os.fstat(self.fileno()).st_mode):
-                self.lost = error.strerror
+                self.lost = error.strerror or str(error)
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, self.fileno())
             os.close(nowhere)

@@ -208,7 +208,7 @@ def _leading_out(pair: PairSpec, out: Path) -> str:
 def _job(pair: PairSpec, cohort: Cohort, settings: RegistrationSettings) -> Job:
     files = PairFiles(**pair.files, out=cohort.out / pair.subject / pair.name)
     names = _submissions(pair) if cohort.layout == "learn2reg" else ()
-    submissions = tuple(cohort.out / SUBMISSION / name for name in names)
+    submissions = [cohort.out / SUBMISSION / name for name in names]
     return Job(
         name=pair.name,
         files=files,
@@ -216,8 +216,8 @@ def _job(pair: PairSpec, cohort: Cohort, settings: RegistrationSettings) -> Job:
         device=cohort.device,
         memory=cohort.memory,
         report=cohort.report,
-        submission=next(iter(submissions), None),
-        also=submissions[1:],
+        submission=submissions[0] if submissions else None,
+        also=tuple(submissions[1:]),
         voxels=pair.voxels and pair.files.keys() >= {*_POINTS},
     )
 

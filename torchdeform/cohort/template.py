@@ -20,7 +20,7 @@ from torchdeform.core.transform import Displacement, Transform
 from torchdeform.core.warp import compose
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.io import read_image, read_transform, write_image, write_transform
-from torchdeform.io.files import atomic_folder, require_writable
+from torchdeform.io.files import atomic_folder, remove_leftovers, require_writable
 from torchdeform.io.images import ending_like, read_labels, write_labels
 from torchdeform.io.texts import read_json
 from torchdeform.pipeline.register import PairFiles, choose_device
@@ -103,6 +103,8 @@ def build(cohort: Cohort, *, retry_failed: bool = False, report: Listener | None
     """
     subjects = _subjects(cohort)
     require_writable(cohort.out)
+    for place in (cohort.out / SUBJECTS, *(cohort.out / SUBJECTS).glob("*")):
+        remove_leftovers(place)
     reference, failures, rounds = cohort.template.reference or subjects[0].image, [], []
     template, current = None, None
     for number in range(1, cohort.template.rounds + 1):
