@@ -11,6 +11,8 @@ import SimpleITK as sitk
 import torch
 
 from torchdeform.cli.main import main
+from torchdeform.errors import InputError
+from torchdeform.io import read_image
 
 SHAPE = (9, 10, 11)
 
@@ -18,6 +20,15 @@ SHAPE = (9, 10, 11)
 def volume(kind: str = "float32", shape: tuple[int, ...] = SHAPE) -> np.ndarray:
     values = np.random.default_rng(0).random(shape) * 200
     return values.astype(kind)
+
+
+def outcome(path: Path) -> str:
+    """Return why a file is refused, nothing where it is read, with pixels that are finite."""
+    try:
+        assert bool(read_image(path).data.isfinite().all())
+    except InputError as error:
+        return str(error)
+    return ""
 
 
 Make = Callable[[Path], None]

@@ -6,6 +6,7 @@ import zlib
 import numpy as np
 import pytest
 import SimpleITK as sitk
+from broken_files import outcome
 
 from torchdeform.errors import InputError
 from torchdeform.io import gate, read_image
@@ -36,15 +37,6 @@ def shown(path, mode=None):
     with PIL.open(path) as picture:
         upright_picture = OPS.exif_transpose(picture)
         return channels_first(upright_picture.convert(mode) if mode else upright_picture)
-
-
-def outcome(path):
-    """Return why a file is refused, nothing where it is read, with pixels that are finite."""
-    try:
-        assert bool(read_image(path).data.isfinite().all())
-    except InputError as error:
-        return str(error)
-    return ""
 
 
 def channels_first(picture):

@@ -6,6 +6,7 @@ import zlib
 import numpy as np
 import pytest
 import torch
+from broken_files import outcome
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
@@ -106,15 +107,6 @@ def test_what_is_no_image_is_refused(tmp_path, capfd, write, message):
         read_image(tmp_path / "a.tif")
     assert "a.tif" in str(error.value)
     assert capfd.readouterr() == ("", "")
-
-
-def outcome(path):
-    """Return why a file is refused, nothing where it is read, with pixels that are finite."""
-    try:
-        assert bool(read_image(path).data.isfinite().all())
-    except InputError as error:
-        return str(error)
-    return ""
 
 
 def tiny(**tags):

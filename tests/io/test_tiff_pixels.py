@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import SimpleITK as sitk
+from broken_files import outcome
 
 from torchdeform.errors import InputError
 from torchdeform.io import read_image, tiff_pixels
@@ -21,15 +22,6 @@ def values(shape=SHAPE, kind="uint8"):
 
 def read(path):
     return read_image(path).data[0].numpy()
-
-
-def outcome(path):
-    """Return why a file is refused, nothing where it is read, with pixels that are finite."""
-    try:
-        assert bool(read_image(path).data.isfinite().all())
-    except InputError as error:
-        return str(error)
-    return ""
 
 
 def first(array):
