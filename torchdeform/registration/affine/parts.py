@@ -32,13 +32,15 @@ def part_places(fixed: MaskedImage, moving: MaskedImage, linear: Tensor, most: i
         most: number of places at most.
 
     Returns:
-        Squared correlations, and points of the world ``(D,)``.
+        Squared correlations, and points of the world ``(D,)``; none where one image is a speck beside the other.
     """
     size = float(torch.linalg.det(linear).abs()) ** (1 / len(linear))
     voxel = max(fixed.image.grid.spacing)
     part, frame = fixed, _frame(fixed.image, moving.image, linear)
     while math.prod(frame.grid.shape) > _NODES[frame.grid.dim]:
         voxel *= _COARSER
+        if voxel > max(fixed.image.grid.extent):  # too small beside the large image to be looked for in it
+            return []
         part = fixed.coarser(voxel)
         frame = _frame(part.image, moving.image, linear)
     return list(_peaks(_fits(part, _on(frame, moving.coarser(voxel * size))), part.image.grid, frame, most))
