@@ -88,7 +88,7 @@ def test_labels_of_one_image_only_or_of_another_place(folder, capfd):
     _moved_away(folder / "bad.nii")
     assert "--moving-labels" in refused(folder, capfd, "sound.nii.gz", "sound.nii.gz", "--fixed-labels", "good.nii")
     options = ["--fixed-labels", "bad.nii", "--moving-labels", "good.nii"]
-    assert "no label in common" in refused(folder, capfd, "sound.nii.gz", "sound.nii.gz", *options)
+    assert "bad.nii lies beside sound.nii.gz" in refused(folder, capfd, "sound.nii.gz", "sound.nii.gz", *options)
 
 
 @pytest.mark.parametrize("ending", [".tif", ".nii.gz", ".mha", ".nrrd"])

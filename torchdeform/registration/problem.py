@@ -250,9 +250,10 @@ def _thin_axes(grid: Grid) -> tuple[int, ...]:
 
 def _steps(image: Image, frame: Image) -> Tensor:
     """Return by how many nodes of the frame one moves with each axis of an image, the columns of ``(D, D)``."""
-    ends = torch.diag(torch.tensor(image.grid.spacing, dtype=torch.float64))
+    sides, nodes = (torch.tensor(one.grid.spacing, dtype=torch.float64, device="cpu") for one in (image, frame))
+    ends = torch.diag(sides)
     ends = torch.cat([ends, torch.zeros_like(ends[:, :1])], dim=1).unsqueeze(0)
-    places = frame.to_grid(image.to_world(ends))[0] / torch.tensor(frame.grid.spacing, dtype=torch.float64).unsqueeze(1)
+    places = frame.to_grid(image.to_world(ends))[0] / nodes.unsqueeze(1)
     return places[:, :-1] - places[:, -1:]
 
 
@@ -283,7 +284,8 @@ def _through(seen: Image, image: Image) -> Tensor:
     axis = _sparse_axis(steps)
     if axis is None:
         return seen.data
-    step = grid.along((steps[:, axis] * torch.tensor(grid.spacing, dtype=torch.float64)).tolist(), seen.data.double())
+    sides = [step * h for step, h in zip(steps[:, axis].tolist(), grid.spacing, strict=True)]
+    step = grid.along(sides, seen.data.double())
 
     def values(rows: slice) -> Tensor:
         points = grid.points(dtype=torch.float64, device=seen.data.device, rows=rows)

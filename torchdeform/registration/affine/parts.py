@@ -1,7 +1,7 @@
 """Where a small image may lie in a large one: correlations with the large one in all places at once."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -48,7 +48,7 @@ def part_places(fixed: MaskedImage, moving: MaskedImage, linear: Tensor, most: i
 
 def _frame(part: Image, whole: Image, linear: Tensor) -> Image:
     """Return an empty image over the box of the large one, whose voxels are those of the small one, mapped."""
-    axes = linear @ torch.tensor(part.direction, dtype=torch.float64)
+    axes = linear @ torch.tensor(part.direction, dtype=torch.float64, device="cpu")
     grid, blank = part.grid, part.data.new_zeros(())
     frame = Image(blank.expand(1, 1, *grid.shape), grid, (), tuple(map(tuple, axes.tolist())))
     corners = frame.to_grid(whole.to_world(box_corners(whole.grid)))[0]
@@ -95,18 +95,20 @@ def _peaks(fits: Tensor, part: Grid, frame: Image, most: int) -> Iterator[tuple[
         value = float(fits.flatten()[top])
         if value <= 0:
             return
-        place = torch.stack(torch.unravel_index(torch.tensor(top), fits.shape[2:])).double()
-        sizes = torch.tensor(fits.shape[2:])
-        place = torch.where(place < torch.tensor(frame.grid.shape), place, place - sizes)
-        middle = torch.tensor(part.extent) / 2 + place * torch.tensor(part.spacing, dtype=torch.float64)
+        at = torch.unravel_index(torch.tensor(top, device="cpu"), fits.shape[2:])
+        place = [
+            k if k < n else k - size for k, n, size in zip(map(int, at), frame.grid.shape, fits.shape[2:], strict=True)
+        ]
+        middle = [side / 2 + k * h for side, k, h in zip(part.extent, place, part.spacing, strict=True)]
+        middle = torch.tensor(middle, dtype=torch.float64, device="cpu")
         yield value, frame.to_world(middle.view(1, -1, 1)).flatten()
         fits = _without(fits, place, part)
 
 
-def _without(fits: Tensor, place: Tensor, part: Grid) -> Tensor:
+def _without(fits: Tensor, place: Sequence[int], part: Grid) -> Tensor:
     """Return the values with 0 near a place."""
-    near = torch.ones((), dtype=torch.bool)
-    for n, size, k in zip(fits.shape[2:], part.shape, place.tolist(), strict=True):
-        away = (torch.arange(n) - k).remainder(n)
+    near = torch.ones((), dtype=torch.bool, device="cpu")
+    for n, size, k in zip(fits.shape[2:], part.shape, place, strict=True):
+        away = (torch.arange(n, device="cpu") - k).remainder(n)
         near = near.unsqueeze(-1) & (away.minimum(n - away) <= size / 4)
     return fits.masked_fill(near.to(fits.device), 0.0)
