@@ -112,10 +112,20 @@ def test_pixels_of_a_slice_without_spacing_are_no_millimetres(tmp_path):
     assert [read_image(tmp_path / name).unit for name in ("a.dcm", "b.dcm")] == ["mm", "px"]
 
 
-def test_few_slices_are_2d_one_by_one_and_a_volume_together(tmp_path):
-    folder = write_series(tmp_path / "scan", range(4))
-    assert read_image(next(folder.iterdir())).grid.dim == 2
-    assert read_image(folder).grid.shape == (4, *SIZE[::-1])
+@pytest.mark.parametrize("count", range(2, 8))
+def test_few_slices_are_a_volume_too(tmp_path, count):
+    folder = write_series(tmp_path / "scan", range(count))
+    for path in (folder, next(folder.iterdir())):
+        assert read_image(path).grid.shape == (count, *SIZE[::-1])
+
+
+def test_views_of_three_directions_are_2d_each(tmp_path):
+    """A localizer has one series number for slices that cross."""
+    for name, axes in (("a", "1\\0\\0\\0\\1\\0"), ("b", "1\\0\\0\\0\\0\\-1"), ("c", "0\\1\\0\\0\\0\\-1")):
+        write_slice(tmp_path / f"{name}.dcm", 0, **{"0020_0037": axes})
+    assert read_image(tmp_path / "b.dcm").grid.shape == SIZE[::-1]
+    with pytest.raises(InputError, match=r"holds 3 DICOM series: 'scan 1.2.3' \(1 file, a.dcm for one\)"):
+        read_image(tmp_path)
 
 
 @pytest.mark.parametrize("tags", [{"0018_1060": "{moment}"}, {"0008_0032": "1200{moment:02d}"}, {}])
