@@ -15,9 +15,9 @@ NO_SCALE: Scale = ((1.0, 1.0, 1.0), "px")
 
 # Length of a unit in millimetres, by the names that ImageJ and OME write. Shorter ones than 0.1 mm are shown in µm.
 _MILLIMETRES = {
-    "pm": 1e-9, "Å": 1e-7, "å": 1e-7, "nm": 1e-6, "nanometer": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "\\u00b5m": 1e-3, "micron": 1e-3,
-    "microns": 1e-3, "micrometer": 1e-3, "mm": 1.0, "millimeter": 1.0, "cm": 10.0, "centimeter": 10.0, "dm": 100.0, "m": 1e3,
-    "thou": 0.0254, "pt": 25.4 / 72, "in": 25.4, "ft": 304.8,
+    "pm": 1e-9, "Å": 1e-7, "å": 1e-7, "nm": 1e-6, "nanometer": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3,
+    "\\u00b5m": 1e-3, "micron": 1e-3, "microns": 1e-3, "micrometer": 1e-3, "mm": 1.0, "millimeter": 1.0, "cm": 10.0,
+    "centimeter": 10.0, "dm": 100.0, "m": 1e3, "thou": 0.0254, "pt": 25.4 / 72, "in": 25.4, "ft": 304.8,
 }  # fmt: skip
 _INCHES = ("inch", "inches", "in")  # ImageJ's unit for a picture that it was given with dots per inch
 
