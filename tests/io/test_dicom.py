@@ -119,6 +119,14 @@ def test_few_slices_are_a_volume_too(tmp_path, count):
         assert read_image(path).grid.shape == (count, *SIZE[::-1])
 
 
+def test_a_copy_of_one_of_two_slices_is_named(tmp_path):
+    folder = write_series(tmp_path / "scan", range(2))
+    shutil.copy(next(folder.iterdir()), folder / "copy.dcm")
+    for path in (folder, folder / "copy.dcm"):
+        with pytest.raises(InputError, match="are slices at the same position; remove one of them"):
+            read_image(path)
+
+
 def test_views_of_three_directions_are_2d_each(tmp_path):
     """A localizer has one series number for slices that cross."""
     for name, axes in (("a", "1\\0\\0\\0\\1\\0"), ("b", "1\\0\\0\\0\\0\\-1"), ("c", "0\\1\\0\\0\\0\\-1")):
@@ -212,7 +220,7 @@ def test_uneven_slices_are_named(tmp_path):
 def test_a_folder_without_dicom_says_what_it_has(tmp_path):
     (tmp_path / "inner").mkdir()
     (tmp_path / "a.txt").write_text("hello", encoding="utf-8")
-    with pytest.raises(InputError, match=r"is a folder without DICOM images \(it has the folders inner\)"):
+    with pytest.raises(InputError, match=r"give the folder of one series \(it has inner\), or an image"):
         read_image(tmp_path)
 
 

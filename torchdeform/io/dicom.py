@@ -113,7 +113,7 @@ def _of_folder(folder: Path) -> list[Slice]:
     """Return the slices of the one series in a folder, sorted."""
     volumes = _volumes(_headers(folder))
     if not volumes:
-        raise InputError(f"{folder} is a folder without DICOM images{_below(folder)}; give an image file")
+        raise InputError(f"{folder} is a folder without DICOM images; give {_below(folder)}an image file")
     first, *others = [one for volume in volumes for one in volume]
     if not others or (first.frames > 1 and all(one.series[:2] == first.series[:2] for one in others)):
         return _of_file(first.path)
@@ -144,7 +144,7 @@ def _over_time(series: Sequence[Slice]) -> str:
 
 def _below(folder: Path) -> str:
     names = [path.name for path in sorted(folder.iterdir()) if path.is_dir()][:3]
-    return f" (it has the folders {', '.join(names)})" if names else ""
+    return f"the folder of one series (it has {', '.join(names)}), or " if names else ""
 
 
 def _headers(folder: Path) -> list[Slice]:
@@ -182,9 +182,11 @@ def _steps(series: Sequence[Slice]) -> NDArray[np.float64]:
 
 
 def _repeats(series: Sequence[Slice]) -> bool:
-    """Return whether positions repeat on purpose: at different times, or in 1.5 times as many slices as positions."""
+    """Return whether positions repeat on purpose: at different times, or in half as many slices more as positions."""
     again = [(one, two) for one, two in pairwise(_sorted(series)) if two.height - one.height <= _SAME]
-    return any(one.moment != two.moment for one, two in again) or len(series) >= 1.5 * (len(_steps(series)) + 1)
+    positions = len(_steps(series)) + 1
+    often = 1.5 if positions > 2 else 2.0  # three slices at two positions are one copy
+    return any(one.moment != two.moment for one, two in again) or len(series) >= often * positions
 
 
 def _image(slices: Sequence[Slice], name: str) -> Image:
