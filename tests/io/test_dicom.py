@@ -112,10 +112,28 @@ def test_pixels_of_a_slice_without_spacing_are_no_millimetres(tmp_path):
     assert [read_image(tmp_path / name).unit for name in ("a.dcm", "b.dcm")] == ["mm", "px"]
 
 
-def test_few_slices_are_2d_one_by_one_and_a_volume_together(tmp_path):
-    folder = write_series(tmp_path / "scan", range(4))
-    assert read_image(next(folder.iterdir())).grid.dim == 2
-    assert read_image(folder).grid.shape == (4, *SIZE[::-1])
+@pytest.mark.parametrize("count", range(2, 8))
+def test_few_slices_are_a_volume_too(tmp_path, count):
+    folder = write_series(tmp_path / "scan", range(count))
+    for path in (folder, next(folder.iterdir())):
+        assert read_image(path).grid.shape == (count, *SIZE[::-1])
+
+
+def test_a_copy_of_one_of_two_slices_is_named(tmp_path):
+    folder = write_series(tmp_path / "scan", range(2))
+    shutil.copy(next(folder.iterdir()), folder / "copy.dcm")
+    for path in (folder, folder / "copy.dcm"):
+        with pytest.raises(InputError, match="are slices at the same position; remove one of them"):
+            read_image(path)
+
+
+def test_views_of_three_directions_are_2d_each(tmp_path):
+    """A localizer has one series number for slices that cross."""
+    for name, axes in (("a", "1\\0\\0\\0\\1\\0"), ("b", "1\\0\\0\\0\\0\\-1"), ("c", "0\\1\\0\\0\\0\\-1")):
+        write_slice(tmp_path / f"{name}.dcm", 0, **{"0020_0037": axes})
+    assert read_image(tmp_path / "b.dcm").grid.shape == SIZE[::-1]
+    with pytest.raises(InputError, match=r"holds 3 DICOM series: 'scan 1.2.3' \(1 file, a.dcm for one\)"):
+        read_image(tmp_path)
 
 
 @pytest.mark.parametrize("tags", [{"0018_1060": "{moment}"}, {"0008_0032": "1200{moment:02d}"}, {}])
@@ -202,7 +220,7 @@ def test_uneven_slices_are_named(tmp_path):
 def test_a_folder_without_dicom_says_what_it_has(tmp_path):
     (tmp_path / "inner").mkdir()
     (tmp_path / "a.txt").write_text("hello", encoding="utf-8")
-    with pytest.raises(InputError, match=r"is a folder without DICOM images \(it has the folders inner\)"):
+    with pytest.raises(InputError, match=r"give the folder of one series \(it has inner\), or an image"):
         read_image(tmp_path)
 
 

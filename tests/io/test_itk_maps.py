@@ -54,13 +54,17 @@ def test_the_order_of_a_spline(tmp_path, order):
          "1 0 0 0 1 0 0 0 1\n", "damaged"),
         ("Transform: DisplacementFieldTransform_double_2_2\nParameters: 0 0\nFixedParameters: 90000 90000 0 0 1 1 "
          "1 0 0 1\n", "damaged"),
-        ("Transform: BSplineTransform_double_3_3\nParameters: 0\nFixedParameters: nan\n", "damaged"),
+        ("Transform: BSplineTransform_double_3_3\nParameters: 0\nFixedParameters: nan\n", "not finite"),
         ("Transform: BSplineTransform_double_3_3\nParameters: 0\nFixedParameters: 4 x 4\n", "damaged"),
         ("Transform: ThinPlateSplineKernelTransform_double_3_3\nParameters: 0\nFixedParameters: 0\n",
          "holds a ThinPlateSplineKernelTransform_double_3_3, which ITK cannot read"),
         ("Transform: AffineTransform_double_4_4\nParameters: 1\nFixedParameters: 0\n", "cannot be read|of 4D"),
-        ("Transform: AffineTransform_double_2_2\nParameters: 1 x\nFixedParameters: 0 0\n", "cannot be read"),
-        ("Transform: AffineTransform_double_2_\udcff\nParameters: 1 0\nFixedParameters: 0 0\n", "cannot be read"),
+        ("Transform: AffineTransform_double_2_2\nParameters: 1 x\nFixedParameters: 0 0\n", "damaged"),
+        ("Transform: Euler2DTransform_double_2_2\nParameters: nan 2 3\nFixedParameters: 4 5\n", "a.tfm holds numbers "
+         "that are not finite; make it again"),
+        ("Transform: ComposeScaleSkewVersor3DTransform_double_3_3\nParameters: 0 0 0 0 0 0 1 1 1 0 0 0\n"
+         "FixedParameters: 0 0 0\n", "holds a transform that SimpleITK has no class for"),
+        ("Transform: AffineTransform_double_2_\udcff\nParameters: 1 0\nFixedParameters: 0 0\n", "damaged"),
         ("hello\n", "cannot be read as a transform; give a transform of ITK"),
     ],
 )  # fmt: skip
@@ -70,6 +74,35 @@ def test_texts_that_are_no_transform(tmp_path, capfd, text, message):
         read(tmp_path / "a.tfm", KNOWN)
     assert "\n" not in str(error.value)
     assert capfd.readouterr() == ("", "")
+
+
+LINEAR = [
+    *(sitk.AffineTransform(dim) for dim in (2, 3)), *(sitk.TranslationTransform(dim) for dim in (2, 3)),
+    *(sitk.ScaleTransform(dim) for dim in (2, 3)), sitk.Euler2DTransform(), sitk.Similarity2DTransform(),
+    sitk.Euler3DTransform(), sitk.VersorTransform(), sitk.VersorRigid3DTransform(), sitk.Similarity3DTransform(),
+    sitk.ScaleVersor3DTransform(), sitk.ScaleSkewVersor3DTransform(),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("transform", LINEAR, ids=lambda t: f"{t.GetName()}{t.GetDimension()}")
+def test_every_linear_transform_is_read_whole_or_not_at_all(tmp_path, transform):
+    """Where its text breaks off, or has a number too few, ITK would take the identity, or 0."""
+    values = np.array(transform.GetParameters()) + np.linspace(0.01, 0.02, transform.GetNumberOfParameters())
+    transform.SetParameters(values.tolist())
+    path = tmp_path / "a.tfm"
+    sitk.WriteTransform(transform, str(path))
+    (found,), text = read(path, KNOWN), path.read_text(encoding="utf-8")
+    point = [3.0, -2.0, 5.0][: transform.GetDimension()]
+    np.testing.assert_allclose(found.matrix @ point + found.offset, transform.TransformPoint(point), atol=1e-9)
+    fixed = text.index("FixedParameters")
+    for part in (text[:fixed], text[: fixed - 30], _one_less(text)):
+        path.write_text(part, encoding="utf-8")
+        with pytest.raises(InputError, match=r"is damaged or incomplete|cannot be read"):
+            read(path, KNOWN)
+
+
+def _one_less(text):
+    return re.sub(r"(?m)^(Parameters:.*) \S+$", r"\1", text)
 
 
 def test_a_transform_without_a_form_here_leads_to_a_field(tmp_path):

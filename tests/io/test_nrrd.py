@@ -122,3 +122,15 @@ def test_comments_and_keys_of_the_user_have_no_say(tmp_path):
 def test_axes_in_different_units_are_refused(tmp_path):
     with pytest.raises(InputError, match="has axes in different units"):
         read_image(_written(tmp_path, nrrd_image(space_units='"um" "um" "mm"')))
+
+
+def test_an_empty_line_in_a_list_of_files_is_named(tmp_path):
+    """ITK counts it as a file of pixels."""
+    for k in range(3):
+        (tmp_path / f"{k}.raw").write_bytes(bytes(20))
+    head = "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 5 4 3\nencoding: raw\ndata file: LIST\n0.raw\n1.raw\n2.raw\n"
+    (tmp_path / "a.nhdr").write_text(head, encoding="utf-8")
+    (tmp_path / "b.nhdr").write_text(head + "\n", encoding="utf-8")
+    assert read_image(tmp_path / "a.nhdr").grid.shape == (3, 4, 5)
+    with pytest.raises(InputError, match=r"b\.nhdr has an empty line in or behind its list of files; delete that line"):
+        read_image(tmp_path / "b.nhdr")

@@ -260,3 +260,21 @@ def test_a_damaged_jpeg_prints_nothing(tmp_path, capfd):
     (tmp_path / "a.jpg").write_bytes(content)
     assert "\n" not in outcome(tmp_path / "a.jpg")
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB", "I;16", "P", "1", "LA"])
+@pytest.mark.parametrize("sound_sum", [True, False])
+def test_a_png_with_a_damaged_byte_is_refused(tmp_path, mode, sound_sum):
+    """Whether the checksum of its chunk fits or not; no pixel may be made up."""
+    noise = np.random.default_rng(0).integers(0, 255, (40, 50), np.uint8)
+    picture = PIL.fromarray(noise.astype(np.uint16) * 200) if mode == "I;16" else PIL.fromarray(noise).convert(mode)
+    picture.save(tmp_path / "a.png")
+    content = (tmp_path / "a.png").read_bytes()
+    start = content.index(b"IDAT") + 4
+    end = start + int.from_bytes(content[start - 8 : start - 4], "big")
+    pixels = bytearray(content[start:end])
+    pixels[len(pixels) // 2] ^= 255
+    total = zlib.crc32(b"IDAT" + pixels).to_bytes(4, "big") if sound_sum else content[end : end + 4]
+    (tmp_path / "a.png").write_bytes(content[:start] + pixels + total + content[end + 4 :])
+    with pytest.raises(InputError, match=r"a\.png cannot be read as an image"):
+        read_image(tmp_path / "a.png")

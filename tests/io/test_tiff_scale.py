@@ -49,6 +49,32 @@ def test_ome_says_the_spacing(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("unit", "length", "shown"),
+    [("nm", 1e-6, "µm"), ("Å", 1e-7, "µm"), ("in", 25.4, "mm"), ("m", 1e3, "mm"), ("pixel", 1.0, "px"),
+     ("reference frame", 1.0, "px")],
+)  # fmt: skip
+def test_units_of_ome(tmp_path, unit, length, shown):
+    """Lengths in mm; what is no length counts pixels."""
+    sizes = {"PhysicalSizeX": 0.5, "PhysicalSizeY": 0.25, "PhysicalSizeXUnit": unit, "PhysicalSizeYUnit": unit}
+    tifffile.imwrite(tmp_path / "a.ome.tif", values(), metadata={"axes": "YX"} | sizes)
+    spacing, found = scale(tmp_path / "a.ome.tif")
+    np.testing.assert_allclose(spacing, (0.25 * length, 0.5 * length))
+    assert found == shown
+
+
+@pytest.mark.parametrize("depth", [{}, {"PhysicalSizeZ": 2.0, "PhysicalSizeZUnit": "pixel"}])
+def test_pages_without_a_distance_are_as_far_apart_as_columns_and_it_is_said(tmp_path, depth):
+    sizes = {"PhysicalSizeX": 0.5, "PhysicalSizeY": 0.25} | depth
+    tifffile.imwrite(tmp_path / "a.ome.tif", values((5, 20, 30)), metadata={"axes": "ZYX"} | sizes)
+    tifffile.imwrite(tmp_path / "b.tif", values((5, 20, 30)), photometric="minisblack", resolution=(2e4, 4e4),
+                     resolutionunit="CENTIMETER", metadata=None)  # fmt: skip
+    for name in ("a.ome.tif", "b.tif"):
+        image = read_image(tmp_path / name)
+        np.testing.assert_allclose(image.grid.spacing, (0.5e-3, 0.25e-3, 0.5e-3))
+        assert ["does not say how far apart its pages are" in remark for remark in image.remarks] == [True]
+
+
+@pytest.mark.parametrize(
     ("unit", "per_unit", "size"),
     [
         ("INCH", 72, None),  # screens
@@ -75,7 +101,7 @@ def test_resolution_tags_count_if_finer_than_prints(tmp_path, unit, per_unit, si
     )
     spacing, shown = scale(tmp_path / "a.tif")
     np.testing.assert_allclose(spacing[-2:], (size or 1.0,) * 2, rtol=1e-5)
-    assert (spacing[:-2], shown) == ((1.0,) * (len(shape) - 2), "px" if size is None else "µm")
+    assert (spacing[:-2], shown) == (spacing[-1:] * (len(shape) - 2), "px" if size is None else "µm")
 
 
 @pytest.mark.parametrize("dpi", [72, 300])

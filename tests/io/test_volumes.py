@@ -2,8 +2,11 @@
 
 import gzip
 import os
+import re
+import shutil
 import struct
 
+import nibabel
 import numpy as np
 import pytest
 import SimpleITK as sitk
@@ -13,6 +16,7 @@ from broken_files import SHAPE, meta_image, nrrd_image, save, volume
 from torchdeform.errors import InputError
 from torchdeform.io import read_image, read_labels
 from torchdeform.io.images import image_size
+from torchdeform.io.volumes import read_volume
 
 KINDS = [
     ".nii",
@@ -145,3 +149,25 @@ def test_pixels_know_their_header(tmp_path):
     save(volume(), tmp_path / "a.mhd")
     with pytest.raises(InputError, match=r"a\.raw holds pixels only; give its header, a\.mhd"):
         read_image(tmp_path / "a.raw")
+
+
+@pytest.mark.parametrize("ending", [".nii", ".nii.gz", ".mgz", ".hdr", ".nrrd", ".mha", "", ".1"])
+def test_the_command_that_takes_a_volume_out_of_a_series_works(tmp_path, monkeypatch, ending):
+    """Whatever the name of the series, and whether ITK knows the format or nibabel does."""
+    values = np.random.default_rng(0).random((6, 7, 8, 4)).astype(np.float32)
+    path, affine = tmp_path / f"a{ending}", np.diag([2.0, 3.0, 4.0, 1.0])
+    if ending in (".nrrd", ".mha"):
+        sitk.WriteImage(sitk.GetImageFromArray(values.T, isVector=False), str(path))
+    elif ending.startswith(".mg"):
+        nibabel.save(nibabel.MGHImage(values, affine), path)
+    else:
+        whole = tmp_path / f"whole{ending if ending.startswith(('.n', '.h')) else '.nii.gz'}"
+        nibabel.save((nibabel.Nifti1Pair if ending == ".hdr" else nibabel.Nifti1Image)(values, affine), whole)
+        path = whole if ending == ".hdr" else whole.rename(path)
+    with pytest.raises(InputError, match="is a series of 4 volumes") as error:
+        read_volume(path)
+    monkeypatch.chdir(tmp_path)
+    if renamed := re.search(r"copy it to (\S+),", str(error.value)):
+        shutil.copy(path, renamed[1])
+    exec(str(error.value).partition("give that: ")[2], {"nibabel": nibabel, "SimpleITK": sitk})
+    assert np.array_equal(read_volume(tmp_path / "frame.nii.gz").values[..., 0].T, values[..., 0])

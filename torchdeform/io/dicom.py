@@ -18,9 +18,6 @@ from torchdeform.io.dicom_pixels import pixels
 from torchdeform.io.gate import DAMAGED
 from torchdeform.io.volume import NOT_FINITE, Volume
 
-# A file is read as its whole series when that has so many slices. With fewer it cannot be registered as a volume.
-VOLUME_SLICES = 8
-
 _UNEVEN = 0.1  # share of a step by which the distances of neighbouring slices may differ
 _SHEAR = 0.01  # share of a step by which neighbouring slices may be shifted sideways
 _SAME = 1e-2  # mm; slices closer than this are at the same position
@@ -37,8 +34,8 @@ def read_file(path: Path) -> Image:
 
     Notes:
         The series is all files of the same folder with the same series number, size, orientation and spacing. It is
-        no volume if it has fewer than 8 slices, or several images at one position (a beating heart). To read one
-        slice of a volume, put it into a folder of its own.
+        no volume if it has several images at one position (a beating heart). To read one slice of a volume, put it
+        into a folder of its own.
     """
     return _image(_of_file(path), str(path))
 
@@ -83,7 +80,7 @@ def _of_file(path: Path) -> list[Slice]:
     if here[0].frames > 1:
         return _of_frames(path, here)
     series = next(volume for volume in _volumes(_headers(path.parent)) if any(s.path == path for s in volume))
-    return here if len(series) < VOLUME_SLICES or _repeats(series) else _sorted(series)
+    return here if _repeats(series) else _sorted(series)
 
 
 def _of_frames(path: Path, here: Sequence[Slice]) -> list[Slice]:
@@ -116,15 +113,16 @@ def _of_folder(folder: Path) -> list[Slice]:
     """Return the slices of the one series in a folder, sorted."""
     volumes = _volumes(_headers(folder))
     if not volumes:
-        raise InputError(f"{folder} is a folder without DICOM images{_below(folder)}; give an image file")
+        raise InputError(f"{folder} is a folder without DICOM images; give {_below(folder)}an image file")
+    first, *others = [one for volume in volumes for one in volume]
+    if not others or (first.frames > 1 and all(one.series[:2] == first.series[:2] for one in others)):
+        return _of_file(first.path)
     if len(volumes) > 1:
         titles = ", ".join(f"'{v[0].title}' ({_count(v)}, {v[0].path.name} for one)" for v in volumes)
         raise InputError(
             f"{folder} holds {len(volumes)} DICOM series: {titles}; give one file of the series that you want"
         )
     (series,) = volumes
-    if len(series) == 1 or series[0].frames > 1:
-        return _of_file(series[0].path)
     if not any(s.placed for s in series):
         raise InputError(f"{folder} holds {len(series)} DICOM images that do not say where they are; give one of them")
     if _repeats(series):
@@ -136,7 +134,8 @@ def _of_folder(folder: Path) -> list[Slice]:
 
 def _count(volume: Sequence[Slice]) -> str:
     files = len({s.path for s in volume})
-    return f"{files} files" if files == len(volume) else f"{len(volume)} frames"
+    count, what = (files, "file") if files == len(volume) else (len(volume), "frame")
+    return f"{count} {what}{'s' if count > 1 else ''}"
 
 
 def _over_time(series: Sequence[Slice]) -> str:
@@ -145,7 +144,7 @@ def _over_time(series: Sequence[Slice]) -> str:
 
 def _below(folder: Path) -> str:
     names = [path.name for path in sorted(folder.iterdir()) if path.is_dir()][:3]
-    return f" (it has the folders {', '.join(names)})" if names else ""
+    return f"the folder of one series (it has {', '.join(names)}), or " if names else ""
 
 
 def _headers(folder: Path) -> list[Slice]:
@@ -183,9 +182,11 @@ def _steps(series: Sequence[Slice]) -> NDArray[np.float64]:
 
 
 def _repeats(series: Sequence[Slice]) -> bool:
-    """Return whether positions repeat on purpose: at different times, or in 1.5 times as many slices as positions."""
+    """Return whether positions repeat on purpose: at different times, or in half as many slices more as positions."""
     again = [(one, two) for one, two in pairwise(_sorted(series)) if two.height - one.height <= _SAME]
-    return any(one.moment != two.moment for one, two in again) or len(series) >= 1.5 * (len(_steps(series)) + 1)
+    positions = len(_steps(series)) + 1
+    often = 1.5 if positions > 2 else 2.0  # three slices at two positions are one copy
+    return any(one.moment != two.moment for one, two in again) or len(series) >= often * positions
 
 
 def _image(slices: Sequence[Slice], name: str) -> Image:

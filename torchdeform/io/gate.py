@@ -57,12 +57,12 @@ def _mode(path: Path, what: str) -> int:
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
-        raise InputError(f"{path} does not exist; check the name{_nearest(path)}") from None
+        raise InputError(f"{path} does not exist; check the name{nearest_file(path)}") from None
     except OSError as error:
         raise InputError(f"{path} cannot be opened: {error.strerror}; check its name and permissions") from error
 
 
-def _nearest(path: Path) -> str:
+def nearest_file(path: Path) -> str:
     """Return a hint at the name beside ``path`` that is nearest to it."""
     try:
         return nearest_name(path.name, os.listdir(path.parent))  # noqa: PTH208 - names are enough
@@ -159,7 +159,10 @@ def require_beside(data: Path, header: Path) -> None:
     except (OSError, RuntimeError) as error:  # too long, or links that lead to each other
         raise InputError(f"{header} keeps its pixels in {data.name[:80]}, which cannot be opened; rename it") from error
     if not beside:
-        raise InputError(f"{header} keeps its pixels in {data}, which is not beside it; put both into one folder")
+        raise InputError(
+            f"{header} keeps its pixels in {str(data)[-200:]}, which is not beside it; put both into one folder and "
+            "name the pixels in the header without a folder"
+        )
     require_file(data, "file of pixels")
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from torchdeform.errors import InputError
-from torchdeform.io.gate import DAMAGED, require_beside, require_room
+from torchdeform.io.gate import DAMAGED, nearest_file, require_beside, require_room
 from torchdeform.io.packed import MAGIC
 
 LONGEST = 1 << 20  # bytes of a header that are read
@@ -65,7 +65,8 @@ class Header:
         for file in self.files:
             if not os.path.lexists(file):
                 raise InputError(
-                    f"{self.path} keeps its pixels in {file.name[:80]}, which does not exist; put it beside the header"
+                    f"{self.path} keeps its pixels in {file.name[:80]}, which does not exist; put that file beside the "
+                    f"header, which names it without a folder{nearest_file(file)}"
                 )
             require_beside(file, self.path)
         require_room(self.path, self._needed(), stored=self.stored)

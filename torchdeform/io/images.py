@@ -72,7 +72,7 @@ def read_image(path: str | os.PathLike[str]) -> Image:
     Notes:
         An axis with one sample is dropped, so a volume of one slice is a 2D image. It keeps its position if it is at a
         right angle to the dropped world axis; an oblique slice gets the coordinates of its own plane.
-        One DICOM file is read as its whole series if that is a volume of 8 slices or more, see `dicom.read_file`.
+        One DICOM file is read as its whole series if that is a volume, see `dicom.read_file`.
         TIFF and pictures are known by content, whatever their name, and turned and coloured as a viewer shows them. The
         pages of a TIFF are a volume. The dots per inch of a print are no scale, see `tiff_scale.scale`.
     """

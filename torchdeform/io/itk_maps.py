@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchdeform.errors import InputError
 from torchdeform.io.files import native_stderr
@@ -23,6 +24,9 @@ _STEP = 1024.0
 
 _TEXT = (".tfm", ".txt")
 _UNKNOWN = re.compile(r"create an instance of ['\"]?(\w+)")
+_AFFINE, _ONE_PER_AXIS = ("Affine", "MatrixOffsetTransformBase"), ("Translation", "Scale")
+_COUNTS = {"Rigid2D": 3, "Euler2D": 3, "Similarity2D": 4, "Versor": 3, "Euler3D": 6, "VersorRigid3D": 6,
+           "QuaternionRigid": 7, "Similarity3D": 7, "ScaleVersor3D": 9, "ScaleSkewVersor3D": 15}  # fmt: skip
 _GRIDS = ("BSpline", "DisplacementField")  # transforms whose first fixed parameters are the size of a grid
 
 
@@ -44,13 +48,16 @@ def _read(path: Path, known: str) -> list[Linear | Spline | Volume]:
 
     if path.suffix.lower() in _TEXT:
         with reading(path):
-            _require_grids(path)
+            _require_whole(path)
     with native_stderr() as printed:
         try:
             transform = sitk.ReadTransform(str(path))
         except Exception as error:  # noqa: BLE001 - ITK's, and Python's for what it cannot convert
             if unknown := _UNKNOWN.search(str(error)):
                 raise InputError(f"{path} holds a {unknown[1]}, which ITK cannot read; write it as a field") from None
+            if isinstance(error, KeyError):
+                what = "a transform that SimpleITK has no class for"
+                raise InputError(f"{path} holds {what}; write it as an AffineTransform or as a field") from None
             raise InputError(f"{path} cannot be read as a transform; give {known}") from None
     if any("more than one transform" in line for line in printed):
         raise InputError(f"{path} holds several transforms side by side; write them as one composite, .h5")
@@ -59,16 +66,32 @@ def _read(path: Path, known: str) -> list[Linear | Spline | Volume]:
     return _maps(transform, str(path))
 
 
-def _require_grids(path: Path) -> None:
-    """Raise `InputError` unless a text has as many parameters as the sizes of its grids ask for."""
-    for block in re.split(rb"(?m)^Transform:\s*", path.read_bytes())[1:]:
-        lines = dict(re.findall(rb"(?m)^(\w*Parameters):([^\n]*)", block))
-        fixed = lines.get(b"FixedParameters", b"").split()
-        dim = next((d for d in (2, 3) if re.match(rb"\w+_%d_" % d, block)), 0)
-        if block.startswith(tuple(name.encode() for name in _GRIDS)) and dim:
-            sizes = [float(number) for number in fixed[:dim]] if len(fixed) >= dim else [math.nan]
-            if len(lines.get(b"Parameters", b"").split()) != dim * math.prod(sizes):
-                raise InputError(f"{path} {DAMAGED}")
+def _require_whole(path: Path) -> None:
+    """Raise `InputError` unless every transform of a text has all its parameters, and finite ones.
+
+    Notes:
+        ITK takes the identity where the line of fixed parameters is cut off, and crashes at numbers that are none.
+    """
+    for block in re.split(r"(?m)^[ \t]*Transform:\s*", path.read_text(encoding="utf-8", errors="replace"))[1:]:
+        found = re.match(r"(\w+?)_\w+_([23])_", block)
+        if found is None or found[1].startswith("Composite"):
+            continue
+        lines = dict(re.findall(r"(?m)^[ \t]*(\w*Parameters):([^\n]*)", block))
+        if not {"Parameters", "FixedParameters"} <= lines.keys():
+            raise InputError(f"{path} {DAMAGED}")
+        own, fixed = (np.array(lines[key].split(), np.float64) for key in ("Parameters", "FixedParameters"))
+        if not (np.isfinite(own).all() and np.isfinite(fixed).all()):
+            raise InputError(f"{path} holds numbers that are not finite; make it again")
+        if len(own) != _count(found[1], int(found[2]), fixed, len(own)):
+            raise InputError(f"{path} {DAMAGED}")
+
+
+def _count(name: str, dim: int, fixed: NDArray[np.float64], default: int) -> float:
+    """Return how many parameters a transform of ITK has."""
+    if name.startswith(_GRIDS):
+        return dim * math.prod(fixed[:dim]) if len(fixed) >= dim else math.nan
+    sizes = dict.fromkeys(_AFFINE, dim * (dim + 1)) | dict.fromkeys(_ONE_PER_AXIS, dim) | _COUNTS
+    return sizes.get(name.removesuffix("Transform"), default)
 
 
 def _maps(transform: "sitk.Transform", name: str) -> list[Linear | Spline | Volume]:

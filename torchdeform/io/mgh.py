@@ -9,7 +9,7 @@ import numpy as np
 from torchdeform.errors import InputError
 from torchdeform.io.gate import DAMAGED, reading, require_room
 from torchdeform.io.nifti import place
-from torchdeform.io.packed import opened
+from torchdeform.io.packed import is_packed, opened
 from torchdeform.io.volume import NOT_FINITE, Volume, require_one
 
 _WIDTHS = {0: 1, 1: 4, 3: 4, 4: 2}  # bytes of a number, by FreeSurfer's code of its type
@@ -35,7 +35,7 @@ def read_mgh(path: Path) -> Volume:
     Raises:
         InputError: damaged, of several frames, or with pixels that are NaN or infinite.
     """
-    require_one(path, mgh_size(path)[0])
+    require_one(path, mgh_size(path)[0], endings=(".mgz",) if is_packed(path) else (".mgh",))
     from nibabel.fileholders import FileHolder
     from nibabel.freesurfer.mghformat import MGHImage
 

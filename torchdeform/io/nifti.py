@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torchdeform.errors import InputError
 from torchdeform.io.files import suffix
 from torchdeform.io.gate import DAMAGED, require_beside, require_room
-from torchdeform.io.packed import Stream, opened
+from torchdeform.io.packed import Stream, is_packed, opened
 from torchdeform.io.volume import NOT_FINITE, Volume, is_stack, require_one
 
 _CHUNK = 1 << 22  # bytes read at once
@@ -135,7 +135,7 @@ def read_nifti(path: Path, *, vectors: bool = False) -> Volume:
         Lengths become mm by the unit of the file; pixels are scaled as the header says.
     """
     header = replace(_read_header(path), vectors=vectors)
-    require_one(path, header.space)
+    require_one(path, header.space, endings=(".nii.gz",) if is_packed(path) else (".nii", ".hdr", ".img"))
     with opened(header.data, path) as file:
         values = _pixels(file, header)
     with np.errstate(all="ignore"):  # what is not finite is refused

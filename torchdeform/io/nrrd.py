@@ -64,10 +64,10 @@ def _fields(path: Path) -> tuple[dict[str, str], list[str], int]:
     for line in head.splitlines(keepends=True):
         end += len(line)
         text = os.fsdecode(line).strip()
-        if not text:
-            break
         if found.get("data file", found.get("datafile", "")).startswith("LIST"):
             rest.append(text)
+        elif not text:
+            break
         elif not text.startswith("#") and (parts := re.fullmatch(r"([^:]*): *(?!=)(.*)", text)):
             found[parts[1].strip().lower()] = parts[2].strip()
     return found, rest, end
@@ -99,5 +99,7 @@ def _files(path: Path, data: str, rest: list[str]) -> tuple[Path, ...]:
     if not data or data.upper() == "LOCAL":
         return ()
     if data.startswith("LIST"):
+        if "" in rest:
+            raise InputError(f"{path} has an empty line in or behind its list of files; delete that line")
         return listed_files(path, rest)
     return numbered_files(path, data) if "%" in data else listed_files(path, [data])

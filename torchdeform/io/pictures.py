@@ -142,6 +142,8 @@ def _require_end(path: Path) -> None:
 
 def _orientation(picture: Picture.Image) -> int:
     """Return how the picture must be turned, 1 (not at all) where its tags do not say or are damaged."""
+    if picture.format == "PNG":
+        picture.load()  # which reading the tags does too: its error would get lost below, and then come no more
     try:
         found = picture.getexif().get(_ORIENTATION, 1)
     except Exception:  # noqa: BLE001 - a viewer ignores tags that it cannot read

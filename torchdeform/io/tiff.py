@@ -44,6 +44,10 @@ _PLAIN = 1  # of Compression
 _TABLES = 1 << 16  # bytes that a packing may take beside the pixels
 _KEPT = 4  # bytes of a number of float32, which all become
 _TYPES = ("uint8", "uint16", "float32")  # of ImageJ
+_NO_DEPTH = (
+    "does not say how far apart its pages are; they are taken to be as far apart as its columns: save it with the "
+    "distance of its pages if they are not"
+)
 
 
 def read_tiff(path: Path, *, exact: bool = False) -> Image:
@@ -219,10 +223,13 @@ def _image(pixels: NDArray[np.generic], found: Scale, name: str, held: np.dtype[
     used = [k for k in range(3) if pixels.shape[k + 1] > 1]
     if len(used) < 2:
         raise InputError(f"{name} has size {list(pixels.shape[1:])}; give an image with at least two axes")
-    (spacing, unit), shape = found, tuple(pixels.shape[k + 1] for k in used)
+    ((depth, down, across), unit), shape = found, tuple(pixels.shape[k + 1] for k in used)
+    told = () if depth > 0 or 0 not in used else (f"{name} {_NO_DEPTH}",)
+    spacing = (depth if depth > 0 else across, down, across)
     data = torch.from_numpy(np.ascontiguousarray(pixels, dtype=held).reshape(1, -1, *shape))
     kind = "uint8" if pixels.dtype.kind == "b" else pixels.dtype.name
-    return Image(data, Grid(shape, tuple(spacing[k] for k in used)), name=name, pixel_type=kind, unit=unit)
+    grid = Grid(shape, tuple(spacing[k] for k in used))
+    return Image(data, grid, name=name, pixel_type=kind, unit=unit, remarks=told)
 
 
 def can_page(values: NDArray[np.generic], dim: int) -> bool:

@@ -9,14 +9,15 @@ from xml.etree import ElementTree
 if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage
 
-# Distances of pages, rows and columns in mm (1 where unknown), and the unit to show them in.
+# Distances of pages (NaN where the file does not say), rows and columns in mm or pixels, and the unit to show them in.
 Scale = tuple[tuple[float, float, float], str]
 NO_SCALE: Scale = ((1.0, 1.0, 1.0), "px")
 
 # Length of a unit in millimetres, by the names that ImageJ and OME write. Shorter ones than 0.1 mm are shown in µm.
 _MILLIMETRES = {
-    "nm": 1e-6, "nanometer": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "\\u00b5m": 1e-3, "micron": 1e-3,
-    "microns": 1e-3, "micrometer": 1e-3, "mm": 1.0, "millimeter": 1.0, "cm": 10.0, "centimeter": 10.0, "m": 1e3,
+    "pm": 1e-9, "Å": 1e-7, "å": 1e-7, "nm": 1e-6, "nanometer": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3,
+    "\\u00b5m": 1e-3, "micron": 1e-3, "microns": 1e-3, "micrometer": 1e-3, "mm": 1.0, "millimeter": 1.0, "cm": 10.0,
+    "centimeter": 10.0, "dm": 100.0, "m": 1e3, "thou": 0.0254, "pt": 25.4 / 72, "in": 25.4, "ft": 304.8,
 }  # fmt: skip
 _INCHES = ("inch", "inches", "in")  # ImageJ's unit for a picture that it was given with dots per inch
 
@@ -48,7 +49,8 @@ def scale(file: "TiffFile", page: "TiffPage") -> Scale:
 
 
 def _positive(found: Scale) -> bool:
-    return all(0 < size < math.inf for size in found[0])
+    depth, down, across = found[0]
+    return all(0 < size < math.inf for size in (down, across)) and not (depth <= 0 or depth == math.inf)
 
 
 def _shown(millimetres: float | None) -> str:
@@ -64,11 +66,11 @@ def _ome(file: "TiffFile", _page: "TiffPage") -> Scale | None:
         return None
     if pixels is None or "PhysicalSizeX" not in pixels.attrib:
         return None
-    units = [_MILLIMETRES.get(pixels.get(f"PhysicalSize{axis}Unit", "µm"), 1.0) for axis in "ZYX"]
-    depth, down, across = (
-        float(pixels.get(f"PhysicalSize{axis}", "nan")) * unit for axis, unit in zip("ZYX", units, strict=True)
-    )
-    return (depth if depth > 0 else 1.0, down, across), _shown(units[2])
+    known = {axis: _MILLIMETRES.get(pixels.get(f"PhysicalSize{axis}Unit", "µm")) for axis in "ZYX"}
+    down, across = (float(pixels.get(f"PhysicalSize{axis}", "nan")) * (known[axis] or 1.0) for axis in "YX")
+    depth = float(pixels.get("PhysicalSizeZ", "nan")) * (known["Z"] or 1.0)
+    comparable = depth > 0 and (known["Z"] is None) == (known["X"] is None)
+    return (depth if comparable else math.nan, down, across), _shown(known["X"])
 
 
 def _imagej(file: "TiffFile", page: "TiffPage") -> Scale | None:
@@ -90,7 +92,7 @@ def _slide(file: "TiffFile", page: "TiffPage") -> Scale | None:
             packet = page.tags.valueof(_XMP, b"")
             text = page.description + (packet.decode(errors="replace") if isinstance(packet, bytes) else str(packet))
             if sizes := [float(number) * unit for number in pattern.findall(text)]:
-                return (1.0, min(sizes), min(sizes)), "µm"  # smaller levels may be in it too
+                return (math.nan, min(sizes), min(sizes)), "µm"  # smaller levels may be in it too
     return None
 
 
@@ -99,9 +101,9 @@ def _microscope(file: "TiffFile", _page: "TiffPage") -> Scale | None:
     voxel, scan = file.lsm_metadata or {}, (file.fei_metadata or {}).get("Scan", {})
     if "VoxelSizeX" in voxel:
         depth, down, across = (1e3 * float(voxel[f"VoxelSize{axis}"]) for axis in "ZYX")
-        return (depth or 1.0, down, across), "µm"
+        return (depth or math.nan, down, across), "µm"
     if "PixelWidth" in scan:
-        return (1.0, 1e3 * float(scan["PixelHeight"]), 1e3 * float(scan["PixelWidth"])), "µm"
+        return (math.nan, 1e3 * float(scan["PixelHeight"]), 1e3 * float(scan["PixelWidth"])), "µm"
     return None
 
 
@@ -113,7 +115,7 @@ def _tagged(_file: "TiffFile", page: "TiffPage") -> Scale | None:
     down, across = (size * length for size in _sizes(page))
     if page.software.startswith(_ITK):  # 1 mm where an image has none
         return None if abs(down - 1) + abs(across - 1) < _ONE else ((1.0, down, across), "mm")
-    return ((1.0, down, across), "µm") if max(down, across) < finest else None
+    return ((math.nan, down, across), "µm") if max(down, across) < finest else None
 
 
 def _sizes(page: "TiffPage") -> tuple[float, float]:

@@ -85,11 +85,25 @@ def is_stack(size: Sequence[int]) -> bool:
     return len(size) == 4 and size[3] == sum(n > 1 for n in size[:3])
 
 
-def require_one(path: Path, size: Sequence[int]) -> None:
-    """Raise `InputError` if an image of this size (x, y, z, t, ...) is a series."""
-    if max(size[3:], default=1) > 1:
-        frame = "[:, :, :, 0]" if len(size) == 4 else "[:, :, :, 0, 0]"
-        raise InputError(
-            f"{path} is a series of {math.prod(size[3:])} volumes, size {tuple(size)}; take one out and give that: "
-            f'SimpleITK.WriteImage(SimpleITK.ReadImage("{path}"){frame}, "frame.nii.gz")'
-        )
+def require_one(path: Path, size: Sequence[int], *, endings: Sequence[str] = ()) -> None:
+    """Raise `InputError` if an image of this size (x, y, z, t, ...) is a series.
+
+    Args:
+        path: the file.
+        size: of its axes.
+        endings: names by which nibabel, which then takes a volume out instead of ITK, knows the format.
+    """
+    if max(size[3:], default=1) == 1:
+        return
+    first = f"[{', '.join(':::')}{', 0' * (len(size) - 3)}]"
+    known = not endings or path.name.endswith(tuple(endings))
+    named, rename = (path, "") if known else (f"series{endings[0]}", f"copy it to series{endings[0]}, ")
+    take = (
+        f'nibabel.save(nibabel.load("{named}").slicer{first}, "frame.nii.gz")'
+        if endings
+        else f'SimpleITK.WriteImage(SimpleITK.ReadImage("{named}"){first}, "frame.nii.gz")'
+    )
+    raise InputError(
+        f"{path} is a series of {math.prod(size[3:])} volumes, size {tuple(size)}; {rename}take one out and give that: "
+        f"{take}"
+    )
