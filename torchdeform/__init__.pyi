@@ -26,6 +26,7 @@ from .deformation.versions import (
     DeformationSettings,
     grid_from_initial_monitor,
     grid_from_target_monitor,
+    monitor_misfit,
     track_moving_monitor,
 )
 from .deformation.volumes import simulate_volume_change
@@ -70,8 +71,9 @@ __all__ = [
     "average_maps", "ball_monitor", "box_monitor", "build_template", "compose", "curl", "curvature_monitor",
     "density_monitor", "diagnose", "dice", "discrete_start", "divergence", "find_velocity", "from_jacobian_and_curl",
     "gradient_monitor", "grid_from_initial_monitor", "grid_from_target_monitor", "hausdorff", "integrate", "invert",
-    "jacobian_determinant", "label_monitor", "line_monitor", "load_settings", "normalise_monitor", "read_image",
-    "read_labels", "read_points", "read_transform", "reconstruct", "register", "ring_monitor", "simulate_volume_change",
-    "solve_div_curl", "track_moving_monitor", "warp", "write_image", "write_labels", "write_points", "write_transform",
+    "jacobian_determinant", "label_monitor", "line_monitor", "load_settings", "monitor_misfit", "normalise_monitor",
+    "read_image", "read_labels", "read_points", "read_transform", "reconstruct", "register", "ring_monitor",
+    "simulate_volume_change", "solve_div_curl", "track_moving_monitor", "warp", "write_image", "write_labels",
+    "write_points", "write_transform",
 ]
 # fmt: on

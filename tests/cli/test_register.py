@@ -372,3 +372,12 @@ def test_the_real_engine(folder, make_image, make_displacement):
     one, two = (sitk.ReadImage(f"{name}.nrrd") for name in ("one", "two"))
     theirs = sitk.Resample(two, one, sitk.ReadTransform("two/transform.h5"), sitk.sitkLinear, 0.0)
     assert np.abs(sitk.GetArrayFromImage(theirs) - warped[0, 0].numpy()).max() < 1e-3 * 200
+
+
+def test_a_folder_with_the_name_of_a_result_is_found_before_the_work(folder, engine, capsys):
+    (folder / "results" / "warped.png").mkdir(parents=True)
+    (folder / "results" / "warped.png" / "mine").write_text("mine", encoding="ascii")
+    assert "warped.png is a folder where a file is to be written" in _fails(
+        capsys, 2, "fixed.png", "moving.png", "--out", "results"
+    )
+    assert (folder / "results" / "warped.png" / "mine").is_file()

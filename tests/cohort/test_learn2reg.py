@@ -49,7 +49,7 @@ def test_learn2reg_pairs_with_what_both_images_have(cohort_of, tmp_path):
         ({"registration_val": []}, "names no pairs for the split val"),
         ({"registration_val": "x"}, "names no pairs for the split val"),
         ({"registration_val": [{"fixed": "a"}]}, r"registration_val\[0\] must name a fixed and a moving image"),
-        ({"registration_val": [5]}, "must name a fixed and a moving image"),
+        ({"registration_val": [5], "training": 5}, "must name a fixed and a moving image"),
     ],
 )
 def test_wrong_data_sets(cohort_of, tmp_path, content, sentence):

@@ -80,6 +80,8 @@ def test_resolved_file_says_the_same(cohort_of, tmp_path, monkeypatch):
         (_LIST.replace("b.png", "b$.png"), 5, r"write \$\$ for a dollar sign"),
         (_LIST.replace("b.png", "5"), 5, "a path is a text, got 5"),
         (_LIST + "      name: ../x\n", 6, "a name has letters, digits"),
+        (_LIST + "      name: Con.a\n", 6, "is no device of Windows"),
+        (_LIST + "      name: a.\n", 6, "a name has letters, digits"),
         (_LIST + "      name: .x\n", 6, "a name has letters, digits"),
         (_LIST + "      name: 01\n", 6, "write it in quotes"),
         ("pairs:\n  list:\n    - {fixed: a.png}\n", 4, r"pairs.list\[0\]: 'moving' is missing"),

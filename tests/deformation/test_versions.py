@@ -25,6 +25,7 @@ from torchdeform.deformation.versions import (
     DeformationSettings,
     grid_from_initial_monitor,
     grid_from_target_monitor,
+    monitor_misfit,
     track_moving_monitor,
 )
 from torchdeform.errors import InputError
@@ -579,4 +580,19 @@ def test_a_map_that_is_worn_out_is_told(corrections):
     there = sample(wanted, grid.points(dtype=torch.float64) + shots[-1], grid)
     misfit = float((jacobian_determinant(shots[-1], grid) / there - 1).abs().mean())
     assert (misfit > 0.01) == (corrections == 0) == bool(told)
+    assert float(monitor_misfit(shots[-1], spot(times[-1]), grid)) == pytest.approx(
+        misfit, rel=0.2
+    )  # 1/f is interpolated
     assert all("J misses f by" in str(warning.message) for warning in told)
+
+
+def test_the_misfit_of_a_stretched_square():
+    """A square stretched to twice its size has J = 2 all over, and the misfit of the identity is that of 1/f."""
+    grid, f = Grid((9, 9)), torch.full((2, 1, 9, 9), 3.0, dtype=torch.float64)
+    points = grid.points(dtype=torch.float64)
+    assert monitor_misfit((2**0.5 - 1) * (points - 4) / 1.0, f, grid).tolist() == pytest.approx([1.0, 1.0])
+    uneven = 1 + 0.5 * torch.cos(points[:, :1])
+    wanted = (1 / normalise_monitor(uneven, grid, "reciprocal_mean") - 1).abs().mean()
+    torch.testing.assert_close(monitor_misfit(torch.zeros_like(points), uneven, grid), wanted.view(1))
+    with pytest.raises(InputError, match="monitor_misfit: f must be positive"):
+        monitor_misfit(torch.zeros_like(points), -uneven, grid)

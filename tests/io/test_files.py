@@ -11,7 +11,8 @@ from broken_files import files_in, save, volume
 
 from torchdeform.cli.main import main
 from torchdeform.errors import InputError, MachineError
-from torchdeform.io.files import atomic_folder, remove_leftovers, require_writable
+from torchdeform.io import read_image, write_image
+from torchdeform.io.files import atomic_folder, remove_leftovers, require_target, require_writable
 
 
 @pytest.mark.parametrize("out", ["sound.nii.gz", "sound.nii.gz/deeper", "/proc/nothing/here", "/dev/null"])
@@ -188,3 +189,15 @@ def test_a_link_of_such_a_name_is_not_followed(tmp_path):
     (tmp_path / ".torchdeform-x").symlink_to(tmp_path / "mine")
     remove_leftovers(tmp_path)
     assert (tmp_path / "mine").is_dir()
+
+
+@pytest.mark.parametrize("name", ["a" * 300 + ".nrrd", "a\udcff.mha", "a\udcff.tif"])
+def test_names_that_no_file_can_have(folder, capfd, name):
+    """ITK ends the whole process at a name that does not encode."""
+    for call in (lambda: write_image(read_image("sound.nii.gz"), name), lambda: require_target(Path(name))):
+        with pytest.raises(InputError, match=r"choose another name|rename the file"):
+            call()
+    before = files_in(folder)
+    assert main(["sound.nii.gz", "sound.nii.gz", "--out", name]) == 2
+    assert len(capfd.readouterr().err.splitlines()) == 1
+    assert files_in(folder) == before

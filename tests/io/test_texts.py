@@ -89,6 +89,7 @@ def merged(levels: int) -> str:
         ("? [a, b]\n: c", "the key .* is no text"),
         ("? {a: b}\n: c", "the key .* is no text"),
         ('a: "\\0"', "has a character that no file and no name can have"),
+        ("a: \udcff", "file.yaml has a character that no file and no name can have"),
         ('a: "\\ud800"', "is no valid YAML at line 1"),
         ("a: \x07", "control characters are not allowed|special characters"),
         ("a: !!python/object/apply:os.system [ls]", "is an object of a program; write plain values"),
@@ -105,7 +106,7 @@ def merged(levels: int) -> str:
         ("a: 1\n---\nb: 2", "another document"),
         ("a: b: c", "mapping values are not allowed"),
     ],
-    ids=range(35),
+    ids=range(36),
 )
 def test_yaml_that_is_refused(text, sentence):
     with pytest.raises(InputError, match=sentence) as raised:

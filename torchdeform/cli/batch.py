@@ -16,7 +16,7 @@ from torchdeform.cohort.schema import cohort_schema, read_cohort
 from torchdeform.cohort.settings import EngineSettings
 from torchdeform.cohort.summary import FAILURES, PAGE, Summary
 from torchdeform.core.memory import readable
-from torchdeform.io.files import atomic_folder
+from torchdeform.io.files import atomic_file
 from torchdeform.report.record import write_json
 
 CohortFile = Annotated[Path, typer.Argument(metavar="COHORT.yaml", help="What to register, and how.")]
@@ -96,8 +96,8 @@ def schema(out: SchemaOut = None) -> None:
     if out is None:
         typer.echo(text, nl=False)
         return
-    with atomic_folder(out.parent) as folder:
-        (folder / out.name).write_text(text, encoding="utf-8")
+    with atomic_file(out) as new:
+        new.write_text(text, encoding="utf-8")
     say_written(out)
 
 

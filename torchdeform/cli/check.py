@@ -20,7 +20,7 @@ from torchdeform.cli.options import (
 from torchdeform.core.image import Image, is_oblique, orientation
 from torchdeform.errors import InputError, TorchdeformError, require_choice
 from torchdeform.io import read_image
-from torchdeform.io.files import atomic_folder, suffix
+from torchdeform.io.files import atomic_file, require_target, suffix
 from torchdeform.io.images import read_labels, read_optional
 from torchdeform.io.point_tables import FIXED, MOVING
 from torchdeform.io.points import read_points
@@ -63,6 +63,8 @@ def check(
     require_choice(align, ALIGNMENTS, "--align")
     if out is not None and suffix(out) != ".png":
         raise InputError(f"--out {out}: the picture is a PNG; give a name that ends in .png")
+    if out is not None:
+        require_target(out)
     images = read_image(fixed), read_image(moving)
     masks = read_optional(fixed_mask), read_optional(moving_mask)
     found = preflight(*images, fixed_mask=masks[0], moving_mask=masks[1], aligned=align != "none")
@@ -148,6 +150,6 @@ def _draw(out: Path, fixed: Image, moving: Image) -> Path | None:
     """Write the overlay and return its path; None for a picture and a volume, which cannot be overlaid."""
     if fixed.grid.dim != moving.grid.dim:
         return None
-    with atomic_folder(out.parent) as folder:
-        write_overlay(folder / out.name, fixed, moving)
+    with atomic_file(out) as new:
+        write_overlay(new, fixed, moving)
     return out

@@ -25,7 +25,7 @@ from torchdeform.core.interpolation import COPYING, LABEL_MODE, MODES
 from torchdeform.core.transform import Displacement, Transform
 from torchdeform.core.warp import voxels
 from torchdeform.errors import InputError, require_choice
-from torchdeform.io.files import require_writable, suffix
+from torchdeform.io.files import require_target, require_writable, suffix
 from torchdeform.io.images import (
     FORMATS,
     read_image,
@@ -231,6 +231,7 @@ def _require_output(out: Path, *inputs: Path | None) -> None:
 
     Called before anything is read, so that a wrong name costs no time.
     """
+    require_target(out)
     for path in inputs:
         if path is not None and out.exists() and path.exists() and out.samefile(path):
             raise InputError(f"--out {out} is one of the files to read; choose another name")

@@ -206,10 +206,14 @@ class Journal:
 
 def open_lines(path: Path) -> int:
     """Return the descriptor of a file for `append`; made if missing, `InputError` if it is a pipe or a device."""
-    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
+    taken = f"{path} is no file; remove it, or choose another folder"
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
+    except IsADirectoryError:
+        raise InputError(taken) from None
     if not stat.S_ISREG(os.fstat(file).st_mode):
         os.close(file)
-        raise InputError(f"{path} is no file; remove it, or choose another folder")
+        raise InputError(taken)
     return file
 
 

@@ -70,7 +70,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _images(content: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Return the entries of the image lists that are more than a name."""
-    listed = [image for key in _LISTS for image in content.get(key) or ()]
+    listed = [image for key in _LISTS if isinstance(images := content.get(key), list) for image in images]
     return [image for image in listed if isinstance(image, dict) and isinstance(image.get("image"), str)]
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from torchdeform import __version__
 from torchdeform.cohort.strips import WIDTH, strip_of
 from torchdeform.cohort.task import DONE, FAILED
-from torchdeform.io.files import atomic_folder
+from torchdeform.io.files import atomic_file
 from torchdeform.pipeline.register import OVERVIEW, REPORT, THUMBNAIL
 from torchdeform.report.page import script_hash
 
@@ -129,7 +129,7 @@ def write_page(path: Path, rows: Sequence[Row], failures: Mapping[str, Row]) -> 
         script=script,
         script_hash=script_hash(script),
     )
-    with atomic_folder(path.parent) as folder, (folder / path.name).open("w", encoding="utf-8") as file:
+    with atomic_file(path) as new, new.open("w", encoding="utf-8") as file:
         file.writelines(text)
 
 

@@ -35,14 +35,14 @@ _BELONGS = {
     "reference": "group",
     "both_ways": "all",
 }
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
+_NAME = re.compile(r"(?!(?i:con|prn|aux|nul|com\d|lpt\d)(\.|$))[A-Za-z0-9]([A-Za-z0-9._-]{0,198}[A-Za-z0-9_-])?")
 
 
 def checked_name(name: str) -> str:
     """Return a name that a folder can have on any system; `InputError` if it is none."""
     if not _NAME.fullmatch(name):
-        allowed = "letters, digits, '.', '_' and '-' only and starts with a letter or digit"
-        raise InputError(f"a name has {allowed}: {shown(name)}")
+        allowed = "letters, digits, '.', '_' and '-' only and is no device of Windows; it starts with a letter or digit"
+        raise InputError(f"a name has {allowed} and does not end in '.': {shown(name)}")
     return name
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from torchdeform.cohort.page import WAITING, Row, badge_of, means, write_page
 from torchdeform.cohort.plan import Failure, Job
 from torchdeform.cohort.task import DONE, FAILED, FIGURES, PairReport
-from torchdeform.io.files import atomic_folder
+from torchdeform.io.files import atomic_file
 
 SUMMARY, FAILURES, PAGE = "summary.csv", "failures.csv", "index.html"
 COLUMNS = ("name", "status", *FIGURES, "seconds", "peak_memory_mb", "gpu_memory_mb", "folder")
@@ -92,7 +92,7 @@ def _failure_row(failure: Failure, out: Path) -> Row:
 
 def _write_table(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
     """Write a table that appears complete or not at all."""
-    with atomic_folder(path.parent) as folder, (folder / path.name).open("w", encoding="utf-8", newline="") as file:
+    with atomic_file(path) as new, new.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)

@@ -183,14 +183,15 @@ def track_moving_monitor(
         step to step for a callable, which is called once a step, and from time to time for a stack. For such f the
         equation above is exact, so J = f(φ, t) holds at the end of each step however long; the path of the nodes
         between is of second order in the length. Where motion goes on and on the nodes shear, and the grid holds the
-        map less and less well: a `RuntimeWarning` says so once J misses f by 1 % on average, three times as at first.
+        map less and less well: a `RuntimeWarning` says so once J misses f by 1 % on average, three times as at first;
+        `monitor_misfit` returns by how much, for each time.
         One velocity a step for a callable, one an interval for a stack. Differentiable in the monitors, curl and start.
     """
     times, solver = _checked_times(f_of_t, times), settings.solver
     parts, solver = (solver.steps, replace(solver, steps=1)) if callable(f_of_t) else (1, solver)
     now = _density_at(f_of_t, grid, times, times[0])
     u = _first_displacement(start, now, grid, velocity, settings)
-    shots, first = [u], _misfit(u, now, grid)
+    shots, first = [u], _misfit(u.detach(), now.detach(), grid)
     for begin, end in pairwise(times):
         moments = [begin + (end - begin) * part / parts for part in range(parts)]
         for earlier, later in pairwise([*moments, end]):
@@ -200,20 +201,42 @@ def track_moving_monitor(
             u, now = _follow(u, now, then, v, grid, solver), then
         u = _finish(u, torch.ones_like(now), now, grid, settings)
         shots.append(u)
-        _warn_of_loss(_misfit(u, now, grid), first, end)
+        _warn_of_loss(_misfit(u.detach(), now.detach(), grid), first, end)
     return torch.stack(torch.broadcast_tensors(*shots))
 
 
-@torch.no_grad()
-def _misfit(u: Tensor, density: Tensor, grid: Grid) -> float:
-    """Return the mean of |J(φ)/f(φ) − 1| over the nodes of the worst item, 1/f being the density."""
+def monitor_misfit(u: Tensor, f: Tensor, grid: Grid) -> Tensor:
+    """Return how far a map φ = id + u is from J(φ)(ξ) = f(φ(ξ)), which Versions 2 and 3 ask for.
+
+    Args:
+        u: displacement in units of spacing, ``(B or 1, D, *S)``; of Version 3 that at one time.
+        f: the monitor, at that time, ``(B or 1, 1, *S)``, positive; multiplied by a number so that ∫ 1/f = |Ω|.
+        grid: the grid.
+
+    Returns:
+        The mean of |J(φ)/f(φ) − 1| over the nodes of each item, ``(B,)``: 0.01 is 1 % of the cell size.
+
+    Raises:
+        InputError: shapes, types, or a monitor that is not positive or not finite.
+    """
+    grid.check_vector(u, "monitor_misfit: u")
+    require_positive(f, grid, "monitor_misfit: f")
+    common_batch("monitor_misfit", u, f)
+    return _misfit(u, 1 / normalise_monitor(f, grid, "reciprocal_mean"), grid)
+
+
+def _misfit(u: Tensor, density: Tensor, grid: Grid) -> Tensor:
+    """Return the misfit of each item, 1/f being the density."""
+    batch = common_batch("monitor_misfit", u, density)
     nodes = grid.points(dtype=u.dtype, device=u.device)
-    error = (jacobian_determinant(u, grid) * sample(density, nodes + u, grid) - 1).abs()
-    return float(error.flatten(1).mean(1).amax())
+    there = sample(density.expand(batch, -1, *grid.shape), (nodes + u).expand(batch, -1, *grid.shape), grid)
+    return (jacobian_determinant(u, grid) * there - 1).abs().flatten(1).mean(1)
 
 
-def _warn_of_loss(misfit: float, first: float, time: float) -> None:
+@torch.no_grad()
+def _warn_of_loss(misfits: Tensor, firsts: Tensor, time: float) -> None:
     """Say so where a map has come to be too distorted for its grid to hold what is asked for."""
+    misfit, first = float(misfits.amax()), float(firsts.amax())
     if misfit > max(_LARGE_MISFIT, _GROWTH * first):
         text = (
             f"track_moving_monitor: J misses f by {misfit:.2g} on average at time {time:g}, by {first:.2g} at first: "

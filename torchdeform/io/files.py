@@ -15,6 +15,7 @@ from pathlib import Path
 
 from torchdeform.core.memory import readable
 from torchdeform.errors import InputError, MachineError, of_machine
+from torchdeform.io.gate import require_name
 
 _STDERR = threading.Lock()
 _PREFIX, _LOCK = ".torchdeform-", "lock"  # names of folders of unfinished files, and of the lock in each
@@ -43,6 +44,27 @@ def read_head(path: Path, count: int) -> bytes:
 def is_tiff(path: Path) -> bool:
     """Return whether the content of a file starts like a TIFF, whatever its name: most slides are TIFF too."""
     return read_head(path, 4) in _TIFF
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Yield where to write a file, which becomes ``path`` at the end, or is deleted after an error; `atomic_folder`."""
+    require_target(path)
+    with atomic_folder(path.parent) as folder:
+        yield folder / path.name
+
+
+def require_target(path: Path) -> None:
+    """Raise `InputError` unless a file can have this name; libraries in C++ end the process at some of them."""
+    require_name(path)
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):  # of the folder `atomic_folder` says so
+        pass
+    except OSError as error:
+        if of_machine(error):
+            raise disk_failure(error, path.parent) from error
+        raise InputError(f"cannot write to {path}: {error.strerror}; choose another name") from error
 
 
 @contextmanager
@@ -319,11 +341,17 @@ def _is_dead(place: Path) -> bool:
 
 def _nearest_folder(folder: Path) -> Path:
     """Return the folder itself if it exists, else its nearest parent that exists."""
-    for candidate in (folder, *folder.absolute().parents):
-        if candidate.is_dir():
-            return candidate
-        if candidate.exists() or candidate.is_symlink():
-            raise InputError(f"cannot write to {folder}: {candidate} is not a folder; choose another name")
+    require_name(folder, "folder")
+    try:
+        for candidate in (folder, *folder.absolute().parents):
+            if candidate.is_dir():
+                return candidate
+            if candidate.exists() or candidate.is_symlink():
+                raise InputError(f"cannot write to {folder}: {candidate} is not a folder; choose another name")
+    except OSError as error:  # a name that is too long
+        if of_machine(error):
+            raise disk_failure(error, folder) from error
+        raise InputError(f"cannot write to {folder}: {error.strerror}; choose another name") from error
     raise InputError(f"cannot write to {folder}: there is no such place; choose another folder")
 
 

@@ -13,7 +13,7 @@ from torchdeform.core.image import Image
 from torchdeform.errors import InputError
 from torchdeform.io import dicom, itk
 from torchdeform.io.dicom_header import may_be_dicom
-from torchdeform.io.files import atomic_folder, is_tiff, suffix
+from torchdeform.io.files import atomic_file, is_tiff, suffix
 from torchdeform.io.gate import require_file
 from torchdeform.io.kinds import GZIP, kind_of
 from torchdeform.io.packed import unpack
@@ -128,8 +128,8 @@ def write_image(image: Image, path: str | os.PathLike[str]) -> None:
     file = Path(path)
     pixels = _stored(image, file)
     if suffix(file) in (".tif", ".tiff") and can_page(pixels, image.grid.dim):
-        with atomic_folder(file.parent) as folder:
-            write_tiff(pixels, list(map(image.in_unit, image.grid.spacing)), image.unit, folder / file.name)
+        with atomic_file(file) as new:
+            write_tiff(pixels, list(map(image.in_unit, image.grid.spacing)), image.unit, new)
     else:
         itk.save(itk.from_values(pixels, image), file)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchdeform.core.grid import Grid, slabs
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.io.files import atomic_folder, native_stderr
+from torchdeform.io.files import atomic_file, native_stderr
 from torchdeform.io.loading import no_warnings, reason, volume_of
 from torchdeform.io.volume import Volume, held_type, squared
 
@@ -28,9 +28,9 @@ def save(image: "sitk.Image", path: Path) -> None:
     """
     import SimpleITK as sitk
 
-    with atomic_folder(path.parent) as folder, native_stderr(), no_warnings():
+    with atomic_file(path) as new, native_stderr(), no_warnings():
         try:
-            sitk.WriteImage(image, str(folder / path.name), useCompression=True)
+            sitk.WriteImage(image, str(new), useCompression=True)
         except RuntimeError as error:
             said = f"{path.name} cannot be written: {reason(error)}; choose another format or folder"
             raise InputError(said) from error

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchdeform.core.image import Image
 from torchdeform.errors import InputError
-from torchdeform.io.files import atomic_folder, suffix
+from torchdeform.io.files import atomic_file, suffix
 from torchdeform.io.gate import read_text
 from torchdeform.io.point_tables import READERS, Table, read_table
 
@@ -109,8 +109,8 @@ def write_points(points: Points, path: _Path) -> None:
     file = Path(path)
     require_points_file(file)
     text = _WRITERS[suffix(file)](points)
-    with atomic_folder(file.parent) as folder:
-        (folder / file.name).write_text(text, encoding="utf-8")
+    with atomic_file(file) as new:
+        new.write_text(text, encoding="utf-8")
 
 
 def require_points_file(path: Path) -> None:

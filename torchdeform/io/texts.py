@@ -88,6 +88,8 @@ def _tree(text: str, name: str) -> Any:
     """Return the tree of nodes of a YAML text, None if it is empty."""
     import yaml
 
+    if not _encodes(text):
+        raise InputError(f"{name} has a character that no file and no name can have; write it anew")
     _require_bounded(text, name)
     return yaml.compose(text, _loader())
 

@@ -15,7 +15,7 @@ from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine, Displacement, Stage, Transform
 from torchdeform.errors import InputError
 from torchdeform.io import elastix, itk, itk_maps, matrices
-from torchdeform.io.files import atomic_folder, native_stderr, read_head, require_space, suffix
+from torchdeform.io.files import atomic_file, native_stderr, read_head, require_space, suffix
 from torchdeform.io.gate import require_file
 from torchdeform.io.loading import reason
 from torchdeform.io.maps import Linear, Spline
@@ -281,11 +281,11 @@ _TO_ITK: dict[type, Callable[[Any], "sitk.Transform"]] = {Affine: _affine, Displ
 def _save(transform: "sitk.Transform", path: Path) -> None:
     import SimpleITK as sitk
 
-    with atomic_folder(path.parent) as folder:
-        require_space(folder, 8 * transform.GetNumberOfParameters())  # HDF5 cannot close a file on a full disk
+    with atomic_file(path) as new:
+        require_space(new.parent, 8 * transform.GetNumberOfParameters())  # HDF5 cannot close a file on a full disk
         try:
             with native_stderr():
-                sitk.WriteTransform(transform, str(folder / path.name))
+                sitk.WriteTransform(transform, str(new))
         except RuntimeError as error:
             raise InputError(f"{path} cannot be written: {reason(error)}; use the ending .h5") from error
 

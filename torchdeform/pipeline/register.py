@@ -225,6 +225,7 @@ def register_files(
     require_writable(files.out)
     if not overwrite:
         _require_own(files)
+    _require_no_folders(files.out)
     begin("reading")
     inputs = read_inputs(files, settings, memory)
     fixed, notes = _fit_to_memory(inputs.fixed, settings, memory, where)
@@ -358,6 +359,13 @@ def _earlier_files(out: Path) -> set[str]:
     if not isinstance(names, list) or not isinstance(made_by, dict) or "torchdeform" not in made_by:
         return set()
     return set(filter(is_result, names))
+
+
+def _require_no_folders(out: Path) -> None:
+    """Raise `InputError` if there are folders with the names of results in ``out``; they are never replaced."""
+    for path in sorted(out.iterdir()) if out.is_dir() else ():
+        if is_result(path.name) and path.is_dir() and not path.is_symlink():
+            raise InputError(f"{path} is a folder where a file is to be written; move it away")
 
 
 def _require_own(files: PairFiles) -> None:
