@@ -303,18 +303,48 @@ def sliced(image: Image, axis: int, step: int, first: int = 1) -> Image:
     return replace(image, data=data, grid=Grid(tuple(data.shape[2:]), tuple(spacing)), origin=origin)
 
 
+def averaged(image: Image, axis: int, step: int) -> Image:
+    """The means of so many slices of an image each, in their middle."""
+    means = image.data.unfold(2 + axis, step, 1).mean(-1)
+    middles = torch.nn.functional.pad(means.movedim(2 + axis, -1), (step // 2, 0)).movedim(-1, 2 + axis)
+    return sliced(
+        replace(image, data=middles, grid=Grid(tuple(middles.shape[2:]), image.grid.spacing)), axis, step, step // 2
+    )
+
+
+THICK = [pytest.param(sliced, id="sampled"), pytest.param(averaged, id="averaged")]
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_slices_far_apart_show_the_other_image_as_they_show_their_own(axis):
+@pytest.mark.parametrize("thick", THICK)
+def test_slices_far_apart_show_the_other_image_as_they_show_their_own(axis, thick):
     """Seen through the slices of an image, the same image at full detail is what those slices give, wherever it is."""
     shape = (24, 26, 28)
     fixed = Image(blobs(shape, 2), Grid(shape, (1.5, 1.0, 0.8)), (4.0, -3.0, 9.0))
-    problem = resample_pair(*placed_images(fixed, sliced(fixed, axis, 6), Annotations()), fixed)
+    slices = thick(fixed, axis, 5)
+    problem = resample_pair(*placed_images(fixed, slices, Annotations()), fixed)
     inside = problem.mask > 0.999
     assert problem.held == (axis,)
     torch.testing.assert_close(problem.fixed[inside], problem.moving[inside], atol=1e-4, rtol=0)
-    whole = resample_pair(*placed_images(fixed, sliced(fixed, axis, 2), Annotations()), fixed)
+    back = resample_pair(*placed_images(slices, fixed, Annotations()), slices)
+    torch.testing.assert_close(back.moving, slices.data, atol=1e-4, rtol=0)
+    whole = resample_pair(*placed_images(fixed, thick(fixed, axis, 2), Annotations()), fixed)
     assert torch.equal(whole.fixed, fixed.data)
     assert whole.held == ()
+
+
+@pytest.mark.parametrize("thick", THICK)
+@pytest.mark.parametrize("which", ["fixed", "moving"])
+def test_a_few_thick_slices_end_nearer_than_they_start(thick, which):
+    shape = (40, 56, 60)
+    u = bend(Grid(shape), 0.6)
+    moving = Image(blobs(shape, 1) + 0.5 * torch.randn(1, 1, *shape, generator=torch.manual_seed(0)), Grid(shape))
+    images = {"fixed": replace(moving, data=warp(moving.data, u, moving.grid)), "moving": moving}
+    images[which] = thick(images[which], 0, 8, *([4] if thick is sliced else []))
+    found = register(*images.values(), settings_of(align="none")).displacement
+    truth = u[:, :, 4::8] if which == "fixed" else u
+    error, start = ((truth - d).norm(dim=1)[..., 4:-4, 4:-4].mean() for d in (found, torch.zeros_like(found)))
+    assert error < start
 
 
 @pytest.mark.parametrize("nodes", [2, 5, 7])

@@ -1,5 +1,6 @@
 """What is registered, on one grid: the images as they are compared, where they count, which points belong together."""
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -14,6 +15,7 @@ from torchdeform.core.transform import Affine
 from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import weighted
+from torchdeform.metrics.correlation import lncc
 from torchdeform.metrics.similarity import needs_common_scale
 from torchdeform.registration.settings import RegistrationSettings
 
@@ -22,6 +24,9 @@ _SPARSE = 3.0
 
 # Cosine of the angle with an axis of the grid up to which slices are across that axis.
 _ALONG = 0.9
+
+# Thicknesses of slices that are tried, in distances from slice to slice: points, with gaps, without, overlapping.
+_THICKNESSES = (0.0, 0.5, 1.0, 2.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,21 +230,33 @@ def resample_pair(fixed: PlacedImage, moving: PlacedImage, frame: Image) -> Regi
     """Return the problem of both images sampled on the grid of ``frame``, each where it is in the world.
 
     An image that does not cover the frame has a mask there whether it came with one or not: beyond its edges there is
-    nothing to compare. Where the slices of one are far apart, the other is compared as such slices would show it, and
-    nothing is moved across them, nor across a few slices: what one would need to see for it is not in the image.
+    nothing to compare. Where the slices of one are far apart, the other is compared as such slices would show it,
+    averaged over the thickness that makes it most like them, and nothing is moved across them, nor across a few slices:
+    what one would need to see for it is not in the image.
     """
     like = fixed.image.data
-    images = [resample(s.image, frame, outside=None).to(like) for s in (fixed, moving)]
-    images = [
-        _through(replace(frame, data=images[0]), moving.image),
-        _through(replace(frame, data=images[1]), fixed.image),
-    ]
     masks = [_mask_on(frame, s) for s in (fixed, moving)]
     points = [None if s.points is None else frame.to_grid(s.points).to(like) for s in (fixed, moving)]
     weights = [None if mask is None else mask.to(like) for mask in masks]
     across = [axis for part in (fixed, moving) if (axis := _across(part.image, frame)) is not None]
     held = tuple(sorted({*_thin_axes(frame.grid), *across}))
-    return RegistrationProblem(frame.grid, *images, *weights, *points, held=held)
+
+    def seen(thickness: float) -> RegistrationProblem:
+        images = _averaged(fixed.image, moving.image, thickness), _averaged(moving.image, fixed.image, thickness)
+        return RegistrationProblem(frame.grid, *_seen(*images, frame), *weights, *points, held=held)
+
+    thick = any(_sparse_axis(_steps(a.image, b.image)) is not None for a, b in ((fixed, moving), (moving, fixed)))
+    return max(map(seen, _THICKNESSES), key=_likeness) if thick else seen(0.0)
+
+
+def _likeness(problem: RegistrationProblem) -> float:
+    return float(lncc(problem.fixed, problem.moving, mask=problem.mask, stride=3).mean())
+
+
+def _seen(fixed: Image, moving: Image, frame: Image) -> tuple[Tensor, Tensor]:
+    """Return both images on the frame, each as the slices of the other would show it."""
+    images = [resample(image, frame, outside=None).to(fixed.data) for image in (fixed, moving)]
+    return _through(replace(frame, data=images[0]), moving), _through(replace(frame, data=images[1]), fixed)
 
 
 def _thin_axes(grid: Grid) -> tuple[int, ...]:
@@ -295,6 +312,29 @@ def _through(seen: Image, image: Image) -> Tensor:
         return first.lerp(second, (number - below).clamp(0, 1).to(first))
 
     return over_slabs(values, grid.shape, seen.data.device)
+
+
+def _averaged(seen: Image, image: Image, thickness: float) -> Image:
+    """Return an image averaged over a thickness in distances of the slices of ``image`` if those are far apart.
+
+    Notes:
+        Slices are means, and where they are compared with points, the map bends to match what differs: with means of
+        8 voxels, from an error of 0.30 to one of 0.51 mm instead of 0.21.
+    """
+    steps, grid = _steps(image, seen), seen.grid
+    axis = _sparse_axis(steps)
+    if axis is None or thickness == 0:
+        return seen
+    count = math.ceil(thickness * float(steps[:, axis].norm()))
+    step = grid.along((steps[:, axis] * torch.tensor(grid.spacing, dtype=torch.float64)).tolist(), seen.data.double())
+
+    def values(rows: slice) -> Tensor:
+        points = grid.points(dtype=torch.float64, device=seen.data.device, rows=rows)
+        offsets = [((k + 0.5) / count - 0.5) * thickness for k in range(count)]
+        shown = (sample(seen.data, points + offset * step, grid) for offset in offsets)
+        return sum(shown, next(shown)) / count
+
+    return replace(seen, data=over_slabs(values, grid.shape, seen.data.device))
 
 
 def _mask_on(frame: Image, placed: PlacedImage) -> Tensor | None:
