@@ -169,3 +169,12 @@ def test_completion_knows_values():
     line = {"COMP_WORDS": "torchdeform register --preset ", "COMP_CWORD": "3"}
     found = fresh("sys.exit(torchdeform())", _TORCHDEFORM_COMPLETE="complete_bash", **line)
     assert found.split() == preset_names()
+
+
+@pytest.mark.parametrize(("program", "before"), [(main, []), (torchdeform, ["check"])])
+def test_an_empty_argument_is_not_the_folder_that_the_shell_is_in(program, before, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert program([*before, "", "moving.nii.gz", "--out", ""]) == 2
+    assert f"argument {len(before) + 1}" in (said := capsys.readouterr().err)
+    assert "is empty; check the variable or the quotes" in said
+    assert not list(tmp_path.iterdir())

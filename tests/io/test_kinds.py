@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from broken_files import SHAPE, meta_image, nrrd_image, save, volume
 
+from torchdeform.errors import InputError
+from torchdeform.io import read_image
 from torchdeform.io.kinds import kind_of, known_otherwise
 
 WRITTEN = {
@@ -69,3 +71,18 @@ def test_kinds_by_content(tmp_path, content, kind):
 def test_what_is_no_image_at_all(tmp_path, content, what):
     (tmp_path / "x").write_bytes(content)
     assert known_otherwise(tmp_path / "x").startswith(what)
+
+
+def test_zeros_are_no_image_and_a_bomb_of_them_is_not_unpacked(tmp_path, monkeypatch):
+    """A file of zeros is what a broken download leaves; packed, it would fill the disk before anybody looked."""
+    (tmp_path / "a.nii").write_bytes(bytes(9000))
+    (tmp_path / "a.mha.gz").write_bytes(gzip.compress(bytes(9000)))
+    (tmp_path / "a.tar.gz").write_bytes(gzip.compress(bytes(257) + b"ustar" + bytes(9000)))
+    monkeypatch.setattr("torchdeform.io.images.unpack", None)
+    for name, message in (
+        ("a.nii", "zero bytes"),
+        ("a.mha.gz", "zero bytes"),
+        ("a.tar.gz", "is a tar archive; unpack"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_image(tmp_path / name)

@@ -64,3 +64,12 @@ def test_nan_and_what_cannot_be_there(tmp_path):
         (tmp_path / name).write_bytes(stored)
         with pytest.raises(InputError, match=rf"{name} announces .*far more than it can hold"):
             read_image(tmp_path / name)
+
+
+def test_a_packed_file_whose_checksum_does_not_fit_is_refused(tmp_path):
+    values = np.random.default_rng(0).random((9, 8, 7)).astype(np.float32)
+    content = bytearray(gzip.compress(nibabel.MGHImage(values, np.eye(4)).to_bytes(), 0))
+    content[len(content) // 2] ^= 255
+    (tmp_path / "a.mgz").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.mgz is damaged or incomplete"):
+        read_image(tmp_path / "a.mgz")

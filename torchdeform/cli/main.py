@@ -17,7 +17,7 @@ from torchdeform.cli.options import Version
 from torchdeform.cli.register import register
 from torchdeform.cli.streams import STOPPED, interruptible, lost_output, steady
 from torchdeform.cli.template import template
-from torchdeform.errors import TRACEBACK, explain
+from torchdeform.errors import TRACEBACK, InputError, explain
 
 _STOP = "stopped; what is finished is kept and nothing is half-written, run the same command again to continue"
 
@@ -125,6 +125,7 @@ def _run(app: typer.Typer, name: str, arguments: Sequence[str] | None) -> int:
     steady()
     try:
         with interruptible():
+            _require_given(sys.argv[1:] if arguments is None else arguments)
             code = app(args=arguments, prog_name=name, standalone_mode=False) or 0
     except KeyboardInterrupt:
         code = STOPPED
@@ -141,6 +142,14 @@ def _run(app: typer.Typer, name: str, arguments: Sequence[str] | None) -> int:
         typer.echo(f"{name}: standard output cannot be written: {why}; the work itself is done", err=True)
         return code or 1
     return code
+
+
+def _require_given(arguments: Sequence[str]) -> None:
+    """Raise `InputError` if an argument is empty: as a path it would be the folder that the shell is in."""
+    if "" in arguments:
+        place = list(arguments).index("")
+        after = f" after {arguments[place - 1]}" if place else ""
+        raise InputError(f"argument {place + 1}{after} is empty; check the variable or the quotes that it comes from")
 
 
 def _usage_error(error: typer.TyperException) -> tuple[str, int]:

@@ -15,7 +15,7 @@ from torchdeform.io import dicom, itk
 from torchdeform.io.dicom_header import may_be_dicom
 from torchdeform.io.files import atomic_file, is_tiff, suffix
 from torchdeform.io.gate import require_file
-from torchdeform.io.kinds import GZIP, kind_of
+from torchdeform.io.kinds import GZIP, kind_of, known_otherwise
 from torchdeform.io.packed import unpack
 from torchdeform.io.pictures import is_picture, picture_size, read_picture
 from torchdeform.io.tiff import can_page, read_tiff, tiff_size, write_tiff
@@ -102,6 +102,8 @@ def read_optional(path: Path | None) -> Image | None:
 
 def _read_gzip(path: Path, *, exact: bool) -> Image:
     """Unpack a file into a temporary folder and read it there."""
+    if found := known_otherwise(path):
+        raise InputError(f"{path} {found}")
     with tempfile.TemporaryDirectory() as folder:
         unpacked = Path(folder) / (path.name.removesuffix(".gz") or "image")
         unpack(path, unpacked)

@@ -45,8 +45,10 @@ def kind_of(path: Path) -> str:
 
 
 def known_otherwise(path: Path) -> str:
-    """Return what a file is that is certainly no image, and what to do, as the rest of a sentence; else nothing."""
-    head = read_head(path, _HEAD).lower()
+    """Return what a file is, or packs, that is certainly no image, and what to do, as the rest of a sentence."""
+    head = (_unpacked_head(path) if is_packed(path) else read_head(path, _HEAD)).lower()
+    if len(head) == _HEAD and not any(head):
+        return "starts with nothing but zero bytes, as no image does; fetch or export it again"
     for magic, start, name, remedy in _NO_IMAGES:
         if head[start:].startswith(magic.lower()):
             return f"is {name}; {remedy}"

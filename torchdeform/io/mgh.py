@@ -9,7 +9,7 @@ import numpy as np
 from torchdeform.errors import InputError
 from torchdeform.io.gate import DAMAGED, reading, require_room
 from torchdeform.io.nifti import place
-from torchdeform.io.packed import is_packed, opened
+from torchdeform.io.packed import is_packed, opened, read_tail
 from torchdeform.io.volume import NOT_FINITE, Volume, require_one
 
 _WIDTHS = {0: 1, 1: 4, 3: 4, 4: 2}  # bytes of a number, by FreeSurfer's code of its type
@@ -42,6 +42,7 @@ def read_mgh(path: Path) -> Volume:
     with reading(path), opened(path) as file, np.errstate(all="ignore"):  # what is not finite is refused
         image = MGHImage.from_file_map({"image": FileHolder(fileobj=file)}, mmap=False)
         values = np.asarray(image.dataobj)
+        read_tail(file)
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             raise InputError(f"{path} {NOT_FINITE}")
         values = values.reshape(values.shape[:3]).T[..., None]

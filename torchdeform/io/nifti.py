@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from torchdeform.errors import InputError
 from torchdeform.io.files import suffix
 from torchdeform.io.gate import DAMAGED, require_beside, require_room
-from torchdeform.io.packed import Stream, is_packed, opened
+from torchdeform.io.packed import Stream, is_packed, opened, read_tail
 from torchdeform.io.volume import NOT_FINITE, Volume, is_stack, require_one
 
 _CHUNK = 1 << 22  # bytes read at once
-_LONGEST_TAIL = 64_000_000  # bytes behind the pixels that are read, for the checksum at the end of a packed file
 
 # Name, type and position of fields of the header, by the number that it starts with, which is its length.
 _FIELDS = {
@@ -209,9 +208,7 @@ def _pixels(file: Stream, header: _Header) -> NDArray[np.generic]:
         content += part
     if len(content) < header.length:
         raise InputError(f"{header.path} {DAMAGED}")
-    tail = 0
-    while tail < _LONGEST_TAIL and (part := file.read(_CHUNK)):
-        tail += len(part)
+    read_tail(file)
     count, kind = header.numbers
     values = np.frombuffer(content, kind).reshape(header.vector, *header.space[::-1], count)
     values = np.moveaxis(values, 0, -2).reshape(*header.space[2::-1], -1)

@@ -16,7 +16,7 @@ from torchdeform.io.gate import DAMAGED
 Stream = BinaryIO | gzip.GzipFile
 
 MAGIC = b"\x1f\x8b"
-_CHUNK = 1 << 22  # bytes read at once
+_CHUNK, _LONGEST_TAIL = 1 << 22, 64_000_000  # bytes read at once, and behind pixels
 _FULL, _LONGEST = 1 / 4, 2e9  # share of what is free on a disk, or of memory, and bytes that a file may take unpacked
 
 
@@ -33,6 +33,13 @@ def opened(path: Path, named: Path | None = None) -> Iterator[Stream]:
             yield file
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise InputError(f"{named or path} {DAMAGED}") from error
+
+
+def read_tail(file: Stream) -> None:
+    """Read what is behind the pixels, if it is not long: the checksum of a packed file is at its end."""
+    length = 0
+    while length < _LONGEST_TAIL and (part := file.read(_CHUNK)):
+        length += len(part)
 
 
 def unpack(path: Path, target: Path) -> None:
