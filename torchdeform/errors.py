@@ -19,10 +19,15 @@ _OF_MACHINE = {
 TRACEBACK = "TORCHDEFORM_TRACEBACK"
 
 _WIDEST, _MOST_BITS = 80, 1000  # characters of a wrong value, and bits of a number, that are shown
+_LONGEST = 900  # characters of a sentence
 
 
 class TorchdeformError(Exception):
-    """Base of every error that this package raises on purpose."""
+    """Base of every error that this package raises on purpose: one line, however long or odd what it quotes is."""
+
+    def __init__(self, sentence: str = "") -> None:
+        line = "".join(c if c.isprintable() else " " for c in sentence)
+        super().__init__(line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}")
 
 
 class InputError(TorchdeformError, ValueError):

@@ -216,6 +216,7 @@ def test_a_uniform_monitor_gives_the_identity(velocity, dtype, dim):
         assert u.abs().max() < 100 * torch.finfo(dtype).eps
 
 
+@pytest.mark.filterwarnings("ignore:track_moving_monitor. J misses f")  # by 0.19: one long step
 @pytest.mark.parametrize("device", DEVICES)
 def test_type_and_device_stay(device):
     grid = cube(24)
@@ -529,7 +530,7 @@ def test_wrong_monitors_are_refused():
             run(f, grid, velocity="least_squares")
         with pytest.raises(InputError, match="leaves the curl free"):
             run(f, grid, velocity="poisson", curl=f)
-        with pytest.raises(InputError, match="must be float32 or float64"):
+        with pytest.raises(InputError, match="must be a floating-point tensor of 32 or 64 bits"):
             run(f.half() + f.half(), grid)
     with pytest.raises(InputError, match="grid_from_target_monitor: g must be positive"):
         grid_from_target_monitor(f, grid, holed)

@@ -1,6 +1,7 @@
 """Finite differences as kernels: derivative, divergence, curl, Jacobian matrix, determinant and cofactors."""
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from itertools import product
 
 import torch
@@ -114,7 +115,11 @@ def _by_convolution(field: Tensor, dim: int, kernel: tuple[float, ...], step: fl
     """Return Σ_k kernel_k field(x + k h) / h where the kernel fits, each channel by itself."""
     axes = field.dim() - 2
     weights = kernel_weights(kernel, dim - 2, axes, field, step)
-    return _CONVOLVE[axes](field.flatten(0, 1).unsqueeze(1), weights).view(*field.shape[:2], *_kept(field, dim, kernel))
+    cudnn = torch.backends.cudnn
+    # TF32, which cuDNN takes by itself, would leave 10 bits.
+    with cudnn.flags(enabled=cudnn.enabled, allow_tf32=False) if field.is_cuda else nullcontext():
+        inner = _CONVOLVE[axes](field.flatten(0, 1).unsqueeze(1), weights)
+    return inner.view(*field.shape[:2], *_kept(field, dim, kernel))
 
 
 def _kept(field: Tensor, dim: int, kernel: tuple[float, ...]) -> list[int]:

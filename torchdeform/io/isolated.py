@@ -15,7 +15,9 @@ from torchdeform.io.gate import DAMAGED
 T = TypeVar("T")
 
 _SECONDS, _PER_BYTE = 30.0, 1e-6  # that a reader may take, and more for each byte of the file
-_LIBRARIES, _UNPACKED = 2_000_000_000, 1100  # bytes of addresses for what it loads, and for each byte of the file
+_LIBRARIES, _UNPACKED = 700_000_000, 1100  # bytes for what it loads and needs, and for each byte of the file
+# Every thread would take memory of its own.
+_ENVIRONMENT = {"MALLOC_ARENA_MAX": "2", "OMP_NUM_THREADS": "1", "ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS": "1"}
 
 
 def isolated(
@@ -51,7 +53,7 @@ def isolated(
 @cache
 def _worker(_process: int) -> Worker:
     """Return the one worker of this process; a forked process makes its own."""
-    worker = Worker()
+    worker = Worker(_ENVIRONMENT)
     atexit.register(worker.stop)
     return worker
 
@@ -70,13 +72,13 @@ def _limited(folder: Path, most: int | None, function: Callable[..., T], argumen
             import resource
         except ImportError:  # not on Windows
             return function(*arguments)
-        resource.setrlimit(resource.RLIMIT_AS, (_held() + most, resource.RLIM_INFINITY))
+        resource.setrlimit(resource.RLIMIT_DATA, (_held() + most, resource.RLIM_INFINITY))
     return function(*arguments)
 
 
 def _held() -> int:
-    """Return the bytes of addresses that this process has."""
+    """Return the bytes of data that this process has."""
     try:
-        return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError):
+        return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[5]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, LookupError):
         return 1 << 34

@@ -196,7 +196,7 @@ def floats(cells: Iterable[object], name: str) -> list[float]:
 
 def _number(cell: object) -> float:
     if isinstance(cell, str):
-        return float(cell) if _NUMBER.fullmatch(cell.strip()) else math.nan
+        return float(text) if _NUMBER.fullmatch(text := cell.strip()) else math.nan
     return float(cell) if isinstance(cell, int | float) and not isinstance(cell, bool) else math.nan
 
 
