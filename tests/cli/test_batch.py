@@ -92,7 +92,7 @@ def test_print_config_is_a_file_that_can_be_read(tmp_path, capsys):
 
 def test_only_and_mistakes_at_the_shell(tmp_path, capsys):
     for name in _IMAGES:
-        (tmp_path / name).touch()
+        (tmp_path / name).write_text("something", encoding="utf-8")
     path = _file(tmp_path, _PATTERN)
     assert torchdeform(["batch", path, "--dry-run", "--only", "sub-a"]) == 0
     assert "1 to register" in capsys.readouterr().out

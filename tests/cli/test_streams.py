@@ -70,8 +70,8 @@ def test_register_is_stopped_in_order(folder, monkeypatch, capsys, which):
     ("line", "where"),
     [
         ("grid fixed.png --out out", "torchdeform.pipeline.deformation.write_displacement"),
-        ("apply out/transform.h5 moving.png --reference fixed.png --out w.png", "torchdeform.io.itk._no_warnings"),
-        ("check fixed.png moving.png --out check.png", "torchdeform.cli.check.atomic_folder"),
+        ("apply out/transform.h5 moving.png --reference fixed.png --out w.png", "torchdeform.io.itk.no_warnings"),
+        ("check fixed.png moving.png --out check.png", "torchdeform.cli.check.atomic_file"),
     ],
 )
 def test_every_verb_is_stopped_in_order(folder, monkeypatch, capsys, line, where, which):

@@ -326,7 +326,9 @@ def _averaged(seen: Image, image: Image, thickness: float) -> Image:
     if axis is None or thickness == 0:
         return seen
     count = math.ceil(thickness * float(steps[:, axis].norm()))
-    step = grid.along((steps[:, axis] * torch.tensor(grid.spacing, dtype=torch.float64)).tolist(), seen.data.double())
+    step = grid.along(
+        (steps[:, axis] * torch.tensor(grid.spacing, dtype=torch.float64, device="cpu")).tolist(), seen.data.double()
+    )
 
     def values(rows: slice) -> Tensor:
         points = grid.points(dtype=torch.float64, device=seen.data.device, rows=rows)
