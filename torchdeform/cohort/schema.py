@@ -348,6 +348,11 @@ def _sentence(error: ErrorDetails, keys: tuple[str | int, ...]) -> str:
         return f"there is no key '{_dotted(keys)}'{hint}"
     if kind == "missing":
         return f"{where}'{last}' is missing"
+    if kind == "model_type":
+        known = ", ".join(_known_keys(error["loc"]))
+        return f"{where}{shown(error['input'])} is no mapping; write one or several of its keys below it: {known}"
+    if kind == "tuple_type":
+        return f"{where}{shown(error['input'])} is no list; begin each of its entries with a dash"
     message = error["msg"].removeprefix("Value error, ")
     if kind == "value_error":
         return f"{where}{message}"
