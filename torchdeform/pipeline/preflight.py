@@ -30,6 +30,7 @@ _SPACINGS = (1e-3, 100.0)  # mm
 _SIZE_RATIO = 3.0
 _SCALE_RATIO = 20.0  # of the ranges of grey values
 _MOSTLY = 0.95  # share of voxels that are exactly 0
+_FAINT = 0.02  # share of the range of grey values that a slice without contrast may have
 _FILLED = 0.5  # share of the image without its empty margins
 _FITS = 0.6  # correlation that a flipped image must reach
 _BETTER = 0.25  # and it must be this much better than the image as it is, or this share closer to 1
@@ -186,23 +187,26 @@ def _check_spacing(image: Image, partner: Image) -> Iterator[Finding]:
 
 
 def _check_slices(image: Image) -> Iterator[Finding]:
-    """Slices without contrast, inside an image or as a wide margin."""
-    filled = {axis: _has_contrast(image, axis) for axis in image.grid.axes}
-    for axis, full in filled.items():
-        first, last = (int(k) for k in full.nonzero().flatten()[[0, -1]])
-        if gaps := int((~full[first:last]).sum()):
-            name, index = "zyx"[axis - 2 - image.grid.dim], first + int((~full[first:last]).nonzero()[0])
+    """Slices without contrast, inside an image or as a wide margin, which may have the noise of a JPEG."""
+    least = _FAINT * float(image.data.amax() - image.data.amin())
+    contrasts = {axis: _contrast(image, axis) for axis in image.grid.axes}
+    for axis, contrast in contrasts.items():
+        filled = (contrast > least).nonzero().flatten().tolist() or [0]  # none in a ramp along the axis
+        empty = contrast[filled[0] : filled[-1]] == 0
+        if gaps := int(empty.sum()):
+            name, index = "zyx"[axis - 2 - image.grid.dim], filled[0] + int(empty.nonzero()[0])
             text = f"{image.name} has {gaps} slices along {name} that are constant, between others that are not"
             yield Finding(WARNING, f"{text} (the first has index {index}); export it again")
-    if (kept := math.prod(float(full.float().mean()) for full in filled.values())) < _FILLED:
+    kept = math.prod(float((contrast > least).float().mean()) for contrast in contrasts.values())
+    if kept < _FILLED:
         text = f"{image.name} has margins without contrast in {1 - kept:.0%} of it; crop it to save time"
         yield Finding(NOTE, text)
 
 
-def _has_contrast(image: Image, axis: int) -> Tensor:
-    """Return for each slice along an axis whether it has any contrast."""
+def _contrast(image: Image, axis: int) -> Tensor:
+    """Return the range of grey values of each slice along an axis."""
     others = [k for k in range(image.data.dim()) if k != axis]
-    return image.data.amax(others) > image.data.amin(others)
+    return image.data.amax(others) - image.data.amin(others)
 
 
 def _check_size(fixed: Image, moving: Image) -> Iterator[Finding]:
