@@ -308,7 +308,7 @@ ZERO = torch.zeros(1, 1, 5, 6)
         (ONE * math.nan, ZERO, {}, "f must be finite"),
         (ONE, ZERO * math.inf, {}, "curl and boundary_displacement must be finite"),
         (ONE, ZERO.double(), {}, "all must be float32, or all float64"),
-        (ONE.half(), ZERO.half(), {}, "all must be float32, or all float64"),
+        (ONE.half(), ZERO.half(), {}, "32 or 64 bits"),
         (ONE, ZERO, {"order": 3}, "order must be one of 2, 4"),
         (ONE, ZERO, {"boundary_displacement": ZERO}, "boundary_displacement must have shape"),
         (ONE, ZERO, {"start": ZERO}, "start must have shape"),

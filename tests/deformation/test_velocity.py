@@ -178,7 +178,7 @@ def test_wrong_input_is_refused():
         find_velocity(alpha, grid, "poison")  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"find_velocity: div must have shape \(B, 1, 4, 5\)"):
         find_velocity(alpha[..., 1:], grid)
-    with pytest.raises(InputError, match=r"div must be float32 or float64, got torch\.float16"):
+    with pytest.raises(InputError, match=r"div must be a floating-point tensor of 32 or 64 bits, got torch\.float16"):
         find_velocity(alpha.half(), grid)
     with pytest.raises(InputError, match="velocity 'direct' leaves the curl free; take velocity='div_curl'"):
         find_velocity(alpha, grid, "direct", curl=alpha)

@@ -19,7 +19,9 @@ def refusing(path: Path) -> Iterator[float]:
 
 
 def rambling(path: Path) -> Iterator[float]:
-    raise InputError(f"{path}\nis damaged")
+    error = InputError("")
+    error.args = (f"{path}\nis damaged",)  # it makes one line of what it is given
+    raise error
     yield
 
 

@@ -121,7 +121,9 @@ def hostile(tmp_path, body):
 )
 def test_hostile_headers_are_one_sentence(tmp_path, body):
     path = hostile(tmp_path, body)
-    with pytest.raises(InputError, match=r"a\.dcm (is damaged|holds no DICOM image)") as error:
+    with pytest.raises(
+        InputError, match=r"a\.dcm (is damaged|holds no DICOM image|takes more memory than .* it may be damaged)"
+    ) as error:
         read_image(path)
     assert "\n" not in str(error.value)
     assert image_size(path) is None

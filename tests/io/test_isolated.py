@@ -48,7 +48,7 @@ def test_it_gets_no_more_memory_than_is_free(file, monkeypatch):
 
 def test_it_gets_no_more_memory_than_its_file_can_ask_for(file, monkeypatch):
     monkeypatch.setattr(module, "available", lambda: 10**12)
-    with pytest.raises(MemoryError):
+    with pytest.raises(InputError, match="asks for far more memory than it can fill, so it is damaged"):
         isolated(bytes, 3 * 10**9, path=file)
     assert len(isolated(bytes, 10**6, path=file)) == 10**6
 

@@ -52,6 +52,8 @@ def test_a_pattern_of_files(tmp_path):
 def test_files_of_an_nrrd(tmp_path, data):
     _split_meta(tmp_path, "LOCAL")
     head = nrrd_image(data_file=data)[: -volume().nbytes]
+    if "LIST" in data:  # it ends with the header, which no empty line may end
+        head = head.rstrip() + b"\n"
     (tmp_path / "a.nhdr").write_bytes(head)
     assert _names(tmp_path / "a.nhdr") == ["a.nhdr", *PLANES]
 

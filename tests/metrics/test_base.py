@@ -15,7 +15,6 @@ from torchdeform.core.derivatives import derivative
 from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.metrics.correlation import LNCC_FLOOR, ncc
-from torchdeform.metrics.gradients import ngf
 from torchdeform.metrics.information import MutualInformation, mutual_information
 from torchdeform.metrics.similarity import MEASURES, features, make_similarity
 from torchdeform.metrics.squares import ssd
@@ -255,14 +254,12 @@ def test_images_that_do_not_go_together_are_refused():
             function(fixed.int(), warped.int())
 
 
-def test_too_few_bins_and_nodes_are_refused():
+def test_too_few_bins_are_refused():
     fixed, warped = images((10, 12))
     with pytest.raises(InputError, match="bins must be at least 5, got 4"):
         mutual_information(fixed, warped, bins=4)
     with pytest.raises(InputError, match="bins must be at least 5, got 3"):
         MutualInformation(fixed, bins=3)
-    with pytest.raises(InputError, match="needs 3 nodes"):
-        ngf(fixed[..., :2], warped[..., :2])
 
 
 def test_the_adjoint_is_that_of_the_derivative():

@@ -188,5 +188,7 @@ def reading(path: Path, fault: str = DAMAGED) -> Iterator[None]:
         if isinstance(error, OSError) and error.errno in _MACHINE:
             raise
         if isinstance(error, MemoryError):
-            raise InputError(f"{path} takes more memory than there is here; {CROP}") from error
+            raise InputError(
+                f"{path} takes more memory than there is for it, so it may be damaged; if not, {CROP}"
+            ) from error
         raise InputError(f"{path} {fault}") from error

@@ -44,6 +44,10 @@ def isolated(
     seconds = (_SECONDS if seconds is None else seconds) + _PER_BYTE * size
     try:
         return _worker(os.getpid()).call(_limited, Path.cwd(), _most(size), function, arguments, timeout=seconds)
+    except MemoryError as error:
+        if _most(size) == available():
+            raise
+        raise InputError(f"{path} asks for far more memory than it can fill, so it {DAMAGED}") from error
     except WorkerLost as error:
         raise InputError(f"{path} makes its reader crash, so it {DAMAGED}") from error
     except TimeLimit as error:
