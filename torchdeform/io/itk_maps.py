@@ -64,7 +64,8 @@ def _read(path: Path, known: str) -> list[Linear | Spline | Volume]:
         raise InputError(f"{path} holds several transforms side by side; write them as one composite, .h5")
     if transform.GetDimension() not in (2, 3):
         raise InputError(f"{path} is a transform of {transform.GetDimension()}D; give one of 2D or 3D")
-    return _maps(transform, str(path))
+    with native_stderr():  # of matrices without sense
+        return _maps(transform, str(path))
 
 
 def _require_whole(path: Path) -> None:
