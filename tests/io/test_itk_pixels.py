@@ -1,5 +1,7 @@
 """Pixels that ITK reads in another process."""
 
+from contextlib import suppress
+
 import numpy as np
 import pytest
 import SimpleITK as sitk
@@ -14,6 +16,16 @@ def test_pixels_are_those_of_itk(tmp_path):
     path = tmp_path / "a.tif"
     assert np.array_equal(itk_pixels(str(path)), values)
     assert np.array_equal(isolated(itk_pixels, str(path), path=path), values)
+
+
+def test_warnings_are_as_before_afterwards(tmp_path):
+    """What is read next in the same process may tell a fault by them."""
+    sitk.WriteImage(sitk.Image(20, 30, sitk.sitkUInt8), str(tmp_path / "a.tif"))
+    before = sitk.ProcessObject.GetGlobalWarningDisplay()
+    for path in (tmp_path / "a.tif", tmp_path / "none.tif"):
+        with suppress(RuntimeError):
+            itk_pixels(str(path))
+        assert sitk.ProcessObject.GetGlobalWarningDisplay() == before
 
 
 def test_what_is_made_up_is_an_error(tmp_path, capfd):

@@ -24,9 +24,9 @@ from torchdeform.io.files import atomic_file, require_target, suffix
 from torchdeform.io.images import read_labels, read_optional
 from torchdeform.io.point_tables import FIXED, MOVING
 from torchdeform.io.points import read_points
-from torchdeform.pipeline.annotations import check_labels, check_points
+from torchdeform.pipeline.annotations import check_annotations
 from torchdeform.pipeline.config import load_settings
-from torchdeform.pipeline.preflight import ERROR, NOTE, WARNING, Finding, Report, preflight
+from torchdeform.pipeline.preflight import ERROR, Finding, Report, preflight
 from torchdeform.registration.affine.settings import ALIGNMENTS
 from torchdeform.registration.placement import place
 from torchdeform.registration.problem import Annotations
@@ -72,7 +72,7 @@ def check(
         *_check_annotations(images[0], FIXED, fixed_points, fixed_labels),
         *_check_annotations(images[1], MOVING, moving_points, moving_labels),
     )
-    report = Report(tuple(sorted((*found.findings, *more), key=lambda one: (ERROR, WARNING, NOTE).index(one.severity))))
+    report = Report.made_of(*found.findings, *more)
     predicted = None if report.of(ERROR) else _predicted(*images, *masks, align)
     drawn = _draw(out, *images) if out is not None else None
     (_print_json if json else _print_text)(images, report.findings, predicted, drawn)
@@ -81,11 +81,9 @@ def check(
 
 
 def _check_annotations(image: Image, side: str, points: Path | None, labels: Path | None) -> Iterator[Finding]:
-    """Yield what looks wrong with the landmarks and the labels of an image."""
-    if points is not None:
-        yield from check_points(image, read_points(points, image, side=side).positions, points)
-    if labels is not None:
-        yield from check_labels(image, read_labels(labels))
+    """Return what looks wrong with the landmarks and the labels of an image."""
+    positions = None if points is None else read_points(points, image, side=side).positions
+    return check_annotations(image, positions, points, None if labels is None else read_labels(labels))
 
 
 def _predicted(

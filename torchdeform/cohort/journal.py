@@ -18,7 +18,7 @@ from torchdeform import __version__
 from torchdeform.cohort.plan import Job
 from torchdeform.cohort.task import DONE, PairReport
 from torchdeform.errors import InputError, MachineError, of_machine
-from torchdeform.io.files import disk_failure
+from torchdeform.io.files import disk_failure, sync, take_lock
 from torchdeform.io.gate import require_file
 from torchdeform.io.parts import files_of
 
@@ -84,12 +84,16 @@ class Journal:
                 raise disk_failure(error, folder) from error
             raise InputError(f"cannot write to {folder}: {error.strerror}; choose another folder") from error
         try:
-            self._lock(folder)
+            take_lock(self._file)
             self._read()
+        except BlockingIOError as error:
+            os.close(self._file)
+            raise InputError(f"another run is working in {folder}; wait until it ends, or stop it") from error
         except BaseException:
             os.close(self._file)
             raise
-        _sync_folder(folder)
+        with suppress(OSError):  # so that a crash cannot lose the journal's name
+            sync(folder)
 
     def __enter__(self) -> Self:
         return self
@@ -167,19 +171,6 @@ class Journal:
                 self._digests[same] = digest
         return self._digests[same]
 
-    def _lock(self, folder: Path) -> None:
-        """Lock out other runs until this process ends, however it ends."""
-        try:
-            import fcntl
-        except ImportError:  # no such locks on this system
-            return
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(f"another run is working in {folder}; wait until it ends, or stop it") from error
-        except OSError:  # a file system without locks
-            return
-
     def _read(self) -> None:
         last = b"\n"
         with self._path.open("rb") as file:
@@ -227,13 +218,3 @@ def append(file: int, record: Mapping[str, object]) -> None:
         with suppress(OSError):
             os.ftruncate(file, before)
         raise
-
-
-def _sync_folder(folder: Path) -> None:
-    """Write the folder's list of names to the disk, so that a crash cannot lose the journal's name."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

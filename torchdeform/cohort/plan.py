@@ -15,7 +15,7 @@ from torchdeform.cohort.pairs import pair_specs
 from torchdeform.cohort.schema import Cohort
 from torchdeform.errors import InputError, nearest_name
 from torchdeform.io import read_displacement, read_image
-from torchdeform.io.files import atomic_folder
+from torchdeform.io.files import atomic_file, atomic_folder
 from torchdeform.io.gate import read_text, require_file, require_name
 from torchdeform.io.transforms import write_voxel_displacement
 from torchdeform.pipeline.register import Outcome, PairFiles, register_files
@@ -247,11 +247,11 @@ def register_job(job: Job, *, callback: Callback | None = None) -> Outcome:
 
 def _write_again(file: Path, name: Path) -> None:
     """Give a file another name, or make a copy of it where a file cannot have two."""
-    with atomic_folder(name.parent) as folder:
+    with atomic_file(name) as new:
         try:
-            (folder / name.name).hardlink_to(file)
+            new.hardlink_to(file)
         except OSError:
-            shutil.copyfile(file, folder / name.name)
+            shutil.copyfile(file, new)
 
 
 def _with_titles(files: PairFiles) -> PairFiles:

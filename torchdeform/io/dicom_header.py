@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from pydicom import Dataset
 
 # Files without the preamble start with an element of group 2 or 8: its number, then a VR or a short length.
-# Files without the preamble start with an element of group 2 or 8: its number, then a VR or a short length.
 _MAGIC = 128, b"DICM"
 _BARE = re.compile(rb"[\x02\x08]\0(..(AE|CS|DA|DT|IS|LO|OB|PN|SH|SQ|TM|UI|UL|US)|[\0-\x3f]\0[\0-\x40]\0{3})", re.DOTALL)
 _LIKE = (b"DICM", b"\x02\0", b"\x08\0")

@@ -91,7 +91,7 @@ def atomic_folder(folder: Path, replaced: Callable[[], Iterable[str]] = tuple) -
                 part.mkdir()
             yield new
             if not _places_above(folder):  # else the outer one does it
-                _sync(new)
+                _sync_all(new)
             _exchange(new, old, folder, replaced)
         except Exception as error:
             failure = None if isinstance(error, MachineError) else of_machine(error) or _probe(place)
@@ -153,13 +153,14 @@ def size_of_files(paths: Iterable[Path]) -> int:
     return total
 
 
-def _sync(folder: Path) -> None:
+def _sync_all(folder: Path) -> None:
     """Wait until the files are on the disk: a disk that is not of this machine says only then that it is full."""
     with ThreadPoolExecutor() as pool:  # together they take hardly longer than one
-        list(pool.map(_sync_file, filter(Path.is_file, folder.rglob("*"))))
+        list(pool.map(sync, filter(Path.is_file, folder.rglob("*"))))
 
 
-def _sync_file(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Wait until a file, or a folder's list of names, is on the disk."""
     descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -289,7 +290,7 @@ def _lock(place: Path) -> int | None:
             lock = os.open(place / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
             undo.callback(os.close, lock)
             os.write(lock, platform.node().encode())
-            _take(lock)
+            take_lock(lock)
             (place / _LOCK).stat()
         except (FileNotFoundError, BlockingIOError):
             return None
@@ -297,7 +298,7 @@ def _lock(place: Path) -> int | None:
         return lock
 
 
-def _take(lock: int) -> bool:
+def take_lock(lock: int) -> bool:
     """Lock a file until this process ends, and return whether locks can be had here; raises if it is locked."""
     try:
         import fcntl
@@ -332,7 +333,7 @@ def _is_dead(place: Path) -> bool:
         return False
     try:
         here = os.read(lock, 1000) == platform.node().encode()
-        return (here or time.time() - place.stat().st_mtime > _A_DAY) and _take(lock)
+        return (here or time.time() - place.stat().st_mtime > _A_DAY) and take_lock(lock)
     except OSError:
         return False
     finally:

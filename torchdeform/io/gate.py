@@ -1,7 +1,6 @@
 """The gate of every path from outside: what may be opened, how much of it is read, how much memory it may take."""
 
 import codecs
-import errno
 import os
 import stat
 import warnings
@@ -10,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from torchdeform.core.memory import available, readable
-from torchdeform.errors import InputError, nearest_name
+from torchdeform.errors import InputError, nearest_name, of_machine
 
 DAMAGED = "is damaged or incomplete; fetch or export it again"
 EMPTY = "is empty; fetch or export it again"
@@ -19,7 +18,6 @@ CROP = "crop it, or use a machine with more"
 LONGEST_TEXT = 16_000_000  # bytes of a text: settings, tables, landmarks, transforms
 _SMALL, _DENSEST = 64_000_000, 1100  # bytes that any file may announce; and per byte of a larger one
 _GROWTH = 16  # times that pixels may grow when they are read: bits become float32
-_MACHINE = {errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 _MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 
 
@@ -185,7 +183,7 @@ def reading(path: Path, fault: str = DAMAGED) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in _MACHINE:
+        if isinstance(error, OSError) and of_machine(error):
             raise
         if isinstance(error, MemoryError):
             raise InputError(

@@ -13,6 +13,7 @@ import numpy as np
 from torchdeform.errors import InputError
 from torchdeform.io.gate import DAMAGED, nearest_file, require_beside, require_room
 from torchdeform.io.packed import MAGIC
+from torchdeform.io.volume import SINGULAR, independence
 
 LONGEST = 1 << 20  # bytes of a header that are read
 CUT_OFF = "has a header that is cut off; fetch or export it again"
@@ -176,11 +177,8 @@ def require_matrix(path: Path, text: str) -> None:
     rank = round(math.sqrt(len(values or [])))
     if values is None or not all(map(math.isfinite, values)):
         raise InputError(f"{path} has the direction '{text[:80]}' in its header; correct the header")
-    if values and rank**2 == len(values):
-        columns = np.reshape(values, (rank, rank))
-        lengths = np.linalg.norm(columns, axis=1, keepdims=True)
-        if not lengths.all() or abs(np.linalg.det(columns / lengths)) < 1e-6:
-            raise InputError(f"{path} has a direction matrix that is singular; correct the header")
+    if values and rank**2 == len(values) and independence(np.reshape(values, (rank, rank)).T) < SINGULAR:
+        raise InputError(f"{path} has a direction matrix that is singular; correct the header")
 
 
 def _parse(text: str) -> list[float] | None:

@@ -49,7 +49,6 @@ def _read(path: Path, known: str) -> list[Linear | Spline | Volume]:
     if path.suffix.lower() in _TEXT:
         with reading(path):
             _require_whole(path)
-    sitk.ProcessObject.SetGlobalWarningDisplay(True)  # ITK only warns of several transforms
     with native_stderr() as printed:
         try:
             transform = sitk.ReadTransform(str(path))

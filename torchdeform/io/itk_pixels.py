@@ -5,6 +5,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from torchdeform.io.files import native_stderr
+from torchdeform.io.loading import no_warnings
 
 # What libtiff prints, instead of failing, where it makes up what it cannot read.
 _MADE_UP = ("TIFFFillStrip", "TIFFFillTile", "TIFFReadEncoded", "Read error", "not read completely")
@@ -19,8 +20,7 @@ def itk_pixels(path: str) -> NDArray[Any]:
     """
     import SimpleITK as sitk
 
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)
-    with native_stderr(stdout=True) as printed:
+    with native_stderr(stdout=True) as printed, no_warnings():
         values = sitk.GetArrayFromImage(sitk.ReadImage(path))
     if any(sign in line for line in printed for sign in _MADE_UP):
         raise ValueError(printed[0])

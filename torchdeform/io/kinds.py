@@ -12,14 +12,15 @@ from torchdeform.io.packed import is_packed
 NIFTI, ANALYZE, MGH, META, NRRD, GZIP, UNKNOWN = "nifti", "analyze", "mgh", "meta", "nrrd", "gzip", ""
 
 _HEAD = 4096  # bytes that tell the kind
+_UNPACK = "unpack it and give the image that it holds"
 # What people download or give instead of an image: start and position of its magic bytes, what it is, what to do.
 _NO_IMAGES = (
-    (b"PK\3\4", 0, "a ZIP archive", "unpack it and give the image that it holds"),
-    (b"ustar", 257, "a tar archive", "unpack it and give the image that it holds"),
-    (b"7z\xbc\xaf", 0, "a 7z archive", "unpack it and give the image that it holds"),
-    (b"BZh", 0, "packed with bzip2", "unpack it and give the image that it holds"),
-    (b"\xfd7zXZ", 0, "packed with xz", "unpack it and give the image that it holds"),
-    (b"\x28\xb5\x2f\xfd", 0, "packed with zstd", "unpack it and give the image that it holds"),
+    (b"PK\3\4", 0, "a ZIP archive", _UNPACK),
+    (b"ustar", 257, "a tar archive", _UNPACK),
+    (b"7z\xbc\xaf", 0, "a 7z archive", _UNPACK),
+    (b"BZh", 0, "packed with bzip2", _UNPACK),
+    (b"\xfd7zXZ", 0, "packed with xz", _UNPACK),
+    (b"\x28\xb5\x2f\xfd", 0, "packed with zstd", _UNPACK),
     (b"version https://git-lfs", 0, "a pointer of git-lfs, not the file", "fetch it with git lfs pull"),
     (b"/annex/", 0, "a pointer of git-annex, not the file", "fetch it with git annex get"),
     (b"<!doctype html", 0, "a web page, not the file", "download the file itself"),

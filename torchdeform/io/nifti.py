@@ -13,7 +13,7 @@ from torchdeform.errors import InputError
 from torchdeform.io.files import suffix
 from torchdeform.io.gate import DAMAGED, require_beside, require_room
 from torchdeform.io.packed import Stream, is_packed, opened, read_tail
-from torchdeform.io.volume import NOT_FINITE, Volume, is_stack, require_one
+from torchdeform.io.volume import NOT_FINITE, SINGULAR, Volume, independence, is_stack, require_one
 
 _CHUNK = 1 << 22  # bytes read at once
 
@@ -43,7 +43,6 @@ _UNITS = {1: (1e3, "mm"), 3: (1e-3, "µm")}
 
 _LPS = np.array([[-1.0], [-1.0], [1.0]])  # signs that take RAS, NIfTI's world, to LPS
 
-_SINGULAR = 1e-6  # volume of the cell of three unit vectors that lie in a plane
 _ROUNDED = 5e-3  # share by which two lengths of a header may differ that are the same but for rounding
 _NO_ROTATION = 1.01  # squared length of a quaternion's last three numbers that rounding does not explain
 _APART = 0.25  # of a voxel, by which qform and sform may differ in silence
@@ -308,8 +307,7 @@ def place(values: NDArray[np.generic], rows: NDArray[np.float64], path: Path) ->
             columns[:, axis] = np.cross(columns[:, axis - 2], columns[:, axis - 1])
             columns[:, axis] /= max(np.linalg.norm(columns[:, axis]), np.finfo(float).tiny)
     lengths = np.linalg.norm(columns, axis=0)
-    volume = abs(np.linalg.det(columns / lengths))
-    if not (np.isfinite(lengths).all() and lengths.all() and volume > _SINGULAR):
+    if not independence(columns) > SINGULAR:
         raise InputError(f"{path} has an affine that is singular; correct its header")
     values = values.reshape(*size[::-1], -1)
     return Volume(values, tuple(lengths.tolist()), tuple(origin), columns / lengths)

@@ -232,8 +232,8 @@ def parse_json(text: str, name: str, what: str) -> Any:
     """Return what a JSON text holds, see `read_json`; ``name`` is that of the file."""
     try:
         content = json.loads(text, parse_int=_whole, parse_float=_finite, parse_constant=_finite)
-        for text in _texts_in(content):
-            if problem := _problem(text):
+        for part in _texts_in(content):
+            if problem := _problem(part):
                 raise InputError(problem)
     except RecursionError:
         reason = "it has too many levels"

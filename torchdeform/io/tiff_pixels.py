@@ -59,25 +59,29 @@ def unpacked(series: "Series", path: Path) -> NDArray[Any]:
     Raises:
         InputError: packed in a way that nothing here can unpack.
     """
+    for unpack in (_by_tifffile, _by_pillow, _by_itk):
+        if (found := unpack(series, path)) is not None:
+            return found
     page = series[0].keyframe
+    packing = getattr(page.compression, "name", page.compression)
+    raise InputError(
+        f"{path} is packed as {packing}, {page.bitspersample} bits, which takes a package to read: "
+        "pip install 'torchdeform[formats]', or save it uncompressed"
+    )
+
+
+def _by_tifffile(series: "Series", _path: Path) -> NDArray[Any] | None:
+    """Return what tifffile unpacks; None where it lacks a package, or leaves colours as YCbCr."""
+    page = series[0].keyframe
+    if int(page.photometric) == _YCBCR and int(page.compression) not in _UNPACKED_COLOURS:
+        return None
     try:
-        if int(page.photometric) == _YCBCR and int(page.compression) not in _UNPACKED_COLOURS:
-            raise NotImplementedError("tifffile leaves YCbCr as it is")
         with native_stderr():
             return np.stack([one.asarray() for one in series]) if len(series) > 1 else series[0].asarray()
     except (ImportError, NotImplementedError, ValueError) as error:
         if isinstance(error, ValueError) and "imagecodecs" not in str(error):
             raise
-    found = _by_pillow(series, path)
-    if found is None:
-        found = _by_itk(series, path)
-    if found is None:
-        packing = getattr(page.compression, "name", page.compression)
-        raise InputError(
-            f"{path} is packed as {packing}, {page.bitspersample} bits, which takes a package to read: "
-            "pip install 'torchdeform[formats]', or save it uncompressed"
-        )
-    return found
+        return None
 
 
 def _by_pillow(series: "Series", path: Path) -> NDArray[Any] | None:

@@ -20,6 +20,7 @@ _WIDE = ("int32", "uint32", "int64", "uint64", "float64")
 # How much the products of the columns of a direction matrix may deviate from those of right angles: headers with three
 # digits deviate by up to this much. Less than the second number is left as it is.
 _ROUNDED, _EXACT = 5e-3, 1e-6
+SINGULAR = 1e-6  # `independence` of directions that lie in a plane
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,12 @@ class Volume:
 def held_type(kind: np.dtype[Any], *, exact: bool) -> np.dtype[Any]:
     """Return the type that pixels of a file get: float32, or float64 where ``exact`` and float32 merges values."""
     return np.dtype("float64" if exact and kind.name in _WIDE else "float32")
+
+
+def independence(columns: NDArray[np.float64]) -> float:
+    """Return |det| / Π |column|, from 1 to 0: how far columns ``(D, D)`` of any lengths are from lying in a plane."""
+    lengths = np.linalg.norm(columns, axis=0)
+    return float(abs(np.linalg.det(columns / lengths))) if np.isfinite(lengths).all() and lengths.all() else 0.0
 
 
 def squared(direction: NDArray[np.float64], name: str) -> NDArray[np.float64]:

@@ -15,6 +15,16 @@ _PIXELS = "px"
 _COVERED = 0.9  # share of an image in its labels, and of these in it, below which there is a warning
 
 
+def check_annotations(
+    image: Image, points: Tensor | None, path: Path | None, labels: Image | None
+) -> Iterator[Finding]:
+    """Yield what looks wrong with the landmarks, of the file ``path``, and the labels of an image."""
+    if points is not None and path is not None:
+        yield from check_points(image, points, path)
+    if labels is not None:
+        yield from check_labels(image, labels)
+
+
 def check_points(image: Image, points: Tensor, path: Path) -> Iterator[Finding]:
     """Landmarks that lie outside of their image.
 

@@ -61,6 +61,12 @@ class Report:
 
     findings: tuple[Finding, ...] = ()
 
+    @classmethod
+    def made_of(cls, *findings: Finding) -> "Report":
+        """Return the report of findings in any order."""
+        order = (ERROR, WARNING, NOTE)
+        return cls(tuple(sorted(findings, key=lambda finding: order.index(finding.severity))))
+
     def of(self, severity: str) -> tuple[str, ...]:
         """Return the sentences of one severity."""
         return tuple(finding.text for finding in self.findings if finding.severity == severity)
@@ -126,8 +132,7 @@ def preflight(
         ]
     for image, mask in ((fixed, fixed_mask), (moving, moving_mask)):
         found += [] if mask is None else _check_mask(image, mask)
-    order = (ERROR, WARNING, NOTE)
-    return Report(tuple(sorted(found, key=lambda finding: order.index(finding.severity))))
+    return Report.made_of(*found)
 
 
 def looks_like_labels(image: Image) -> bool:

@@ -23,7 +23,7 @@ from torchdeform.io.point_tables import FIXED, MOVING
 from torchdeform.io.points import matched, read_points
 from torchdeform.io.texts import read_json
 from torchdeform.metrics.evaluation import common_labels
-from torchdeform.pipeline.annotations import check_labels, check_points
+from torchdeform.pipeline.annotations import check_annotations
 from torchdeform.pipeline.memory import advice, fitting_grid, footprint
 from torchdeform.pipeline.preflight import WARNING, Finding, Report, preflight
 from torchdeform.registration.deformable import resample_result
@@ -160,7 +160,7 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
         **_read_points(files, fixed, moving),
     )
     annotations.require_images(fixed.grid.dim)
-    found = Report(tuple(_check_annotations(files, (fixed, moving), annotations)))
+    found = Report.made_of(*_check_annotations(files, (fixed, moving), annotations))
     found.require_ok()
     if labels[0] is not None and labels[1] is not None:  # some must be the same, or nothing can be measured
         first = resample(labels[0], fixed, mode="nearest")
@@ -173,10 +173,8 @@ def _check_annotations(files: PairFiles, images: tuple[Image, Image], annotation
     """Yield what looks wrong with the landmarks and the labels of both images."""
     for side, image in zip((FIXED, MOVING), images, strict=True):
         points, labels = (getattr(annotations, f"{side}_{what}") for what in ("points", "labels"))
-        if points is not None:
-            yield from check_points(image, points[0].T, getattr(files, f"{side}_points"))
-        if isinstance(labels, Image):
-            yield from check_labels(image, labels)
+        positions = None if points is None else points[0].T
+        yield from check_annotations(image, positions, getattr(files, f"{side}_points"), labels)
 
 
 def _read_points(files: PairFiles, fixed: Image, moving: Image) -> dict[str, Tensor]:

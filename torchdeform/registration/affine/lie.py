@@ -31,6 +31,11 @@ def generators(kind: str, dim: int) -> Tensor:
     return torch.stack(shifts + [move for part in _LINEAR[kind] for move in linear[part]])
 
 
+def scale_of(linear: Tensor) -> Tensor:
+    """Return the factor by which matrices ``(*, D, D)`` change lengths on average, |det|^(1/D), ``(*)``."""
+    return torch.linalg.det(linear).abs() ** (1 / linear.shape[-1])
+
+
 def _entry(dim: int, values: dict[tuple[int, int], float]) -> Tensor:
     matrix = torch.zeros(dim, dim + 1, dtype=torch.float64, device="cpu")
     for place, value in values.items():

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, box_corners, resample
+from torchdeform.registration.affine.lie import scale_of
 from torchdeform.registration.affine.objective import MaskedImage
 
 # Nodes of the large image at most, and the factor by which voxels grow until it has no more.
@@ -34,7 +35,7 @@ def part_places(fixed: MaskedImage, moving: MaskedImage, linear: Tensor, most: i
     Returns:
         Squared correlations, and points of the world ``(D,)``; none where one image is a speck beside the other.
     """
-    size = float(torch.linalg.det(linear).abs()) ** (1 / len(linear))
+    size = float(scale_of(linear))
     voxel = max(fixed.image.grid.spacing)
     part, frame = fixed, _frame(fixed.image, moving.image, linear)
     while math.prod(frame.grid.shape) > _NODES[frame.grid.dim]:

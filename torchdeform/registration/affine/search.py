@@ -11,7 +11,7 @@ from torch import Tensor
 from torchdeform.core.grid import limit_threads
 from torchdeform.core.image import background, box_corners, centre_of_mass
 from torchdeform.registration.affine.bfgs import maximise
-from torchdeform.registration.affine.lie import angle, generators, homogeneous, rotations
+from torchdeform.registration.affine.lie import angle, generators, homogeneous, rotations, scale_of
 from torchdeform.registration.affine.objective import AffineObjective, MaskedImage, NormalisedFrame
 from torchdeform.registration.affine.parts import part_places
 
@@ -75,7 +75,7 @@ class SearchResult:
     @property
     def size(self) -> float:
         """How much larger things are in the moving image, by the best map; 1 without one."""
-        return size_of(self.candidates[0].map) if self.candidates else 1.0
+        return float(scale_of(self.candidates[0].map[:-1, :-1])) if self.candidates else 1.0
 
     @property
     def mirrored(self) -> bool:
@@ -83,14 +83,9 @@ class SearchResult:
         return self.mirror > _MIRROR_GAIN
 
 
-def size_of(matrix: Tensor) -> float:
-    """Return the factor by which a map ``(D + 1, D + 1)`` changes lengths on average, |det|^(1/D)."""
-    return float(torch.linalg.det(matrix[:-1, :-1]).abs()) ** (1 / (len(matrix) - 1))
-
-
 def _apart(maps: Tensor) -> Tensor:
     """Return the norms ``(n, n)`` of the differences of maps over their scale, which makes them shares of the image."""
-    size = torch.linalg.det(maps[:, :-1, :-1]).abs() ** (1 / (maps.shape[1] - 1))
+    size = scale_of(maps[:, :-1, :-1])
     difference = (maps.unsqueeze(0) - maps.unsqueeze(1)).flatten(2).norm(dim=2)
     return difference / (size.unsqueeze(0) * size.unsqueeze(1)).sqrt()
 
@@ -125,7 +120,7 @@ def search(
         that turn less.
     """
     rough = "similarity" if kind == "affine" else kind
-    moments = [image_moments(part, objective.frame) for part in (objective.fixed, objective.moving)]
+    moments = [image_moments(image, objective.frame) for image in (objective.fixed, objective.moving)]
     sizes = _sizes(*moments, scale=rough == "similarity") if size is None else [size]
     starts = make_starts(*moments, turn=turn, sizes=sizes)
     if part:
