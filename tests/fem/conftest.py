@@ -59,47 +59,80 @@ class Brute:
             vector[k] += [c * self.shape_function(corner, q, axis) for corner in self.corners]
         return vector.flatten()
 
+    def places(self, centre: bool):
+        """Points and weights of the rule: Gauss points, or the middle of the element."""
+        return [((0.5,) * self.dim, math.prod(self.spacing))] if centre else self.gauss
+
     def matrix(self, rows: Callable, components: int) -> Tensor:
-        """Dense matrix of Σ weight row(v)²; ``rows(element, q index)`` gives (weight, terms) for each row."""
+        """Dense matrix of Σ weight row(v)²; ``rows(element, q index)`` gives (weight, terms, at the centre?)."""
         total = np.zeros((components * self.nodes.size,) * 2)
         for element in itertools.product(*(range(n - 1) for n in self.shape)):
             local = np.zeros((components * len(self.corners),) * 2)
-            for index, (q, volume) in enumerate(self.gauss):
-                for weight, terms in rows(element, index):
-                    vector = self.row(terms, q, components)
-                    local += volume * weight * np.outer(vector, vector)
+            for centre in (False, True):
+                for index, (q, volume) in enumerate(self.places(centre)):
+                    for weight, terms, at in map(whole_row, rows(element, index)):
+                        if at == centre:
+                            vector = self.row(terms, q, components)
+                            local += volume * weight * np.outer(vector, vector)
             where = self.unknowns(element, components)
             total[np.ix_(where, where)] += local
         return torch.from_numpy(total)
 
     def load(self, rows: Callable, data: Tensor, components: int) -> Tensor:
-        """Dense right-hand side of Σ weight data_row row(N), ``data (R, *S)`` interpolated between its nodes."""
+        """Dense right-hand side of Σ weight data_row row(N), ``data (R, *S)`` interpolated between its nodes.
+
+        A row that is looked at in parts has its one channel.
+        """
         total = np.zeros(components * self.nodes.size)
         values = data.numpy().reshape(len(data), -1)
         for element in itertools.product(*(range(n - 1) for n in self.shape)):
             here = values[:, self.unknowns(element, 1)]
-            for index, (q, volume) in enumerate(self.gauss):
-                interpolated = here @ np.array([self.shape_function(c, q, None) for c in self.corners])
-                for (weight, terms), value in zip(rows(element, index), interpolated, strict=True):
-                    total[self.unknowns(element, components)] += (
-                        volume * weight * value * self.row(terms, q, components)
-                    )
+            for centre in (False, True):
+                for index, (q, volume) in enumerate(self.places(centre)):
+                    interpolated = here @ np.array([self.shape_function(c, q, None) for c in self.corners])
+                    some = [row for row in map(whole_row, rows(element, index)) if row[2] == centre]
+                    for (weight, terms, _), value in zip(some, interpolated, strict=False):
+                        total[self.unknowns(element, components)] += (
+                            volume * weight * value * self.row(terms, q, components)
+                        )
         return torch.from_numpy(total)
 
-    def div_curl(self, div=1.0, curl=1.0, zero=0.0) -> Callable:
-        """Rows of the div-curl form; a weight is a number or an array over the elements."""
+    def div_curl(self, div=1.0, curl=1.0, zero=0.0, strain=0.0) -> Callable:
+        """Rows of the div-curl form; a weight is a number or an array over the elements.
+
+        Divergence and curl count exactly up to twice the weight of the other, and at the centre beyond that.
+        """
 
         def at(weight, element):
             return weight if isinstance(weight, float) else float(weight[element])
 
         def rows(element, index):
             first, *others = DIV_CURL[self.dim]
-            yield at(div, element), first
-            yield from ((at(curl, element), other) for other in others)
+            w_div, w_curl, w_strain = (at(weight, element) for weight in (div, curl, strain))
+            for part, centre in ((min(w_div, 2 * w_curl), False), (max(w_div - 2 * w_curl, 0.0), True)):
+                yield part, first, centre
+            for part, centre in ((min(w_curl, 2 * w_div), False), (max(w_curl - 2 * w_div, 0.0), True)):
+                yield from ((part, other, centre) for other in others)
             if not isinstance(zero, float) or zero > 0:
                 yield from ((at(zero, element), [(k, None, 1.0)]) for k in range(self.dim))
+            if w_strain > 0:
+                yield from ((w_strain * c, terms) for c, terms in deviatoric(self.dim))
 
         return rows
+
+
+def whole_row(row):
+    """(weight, terms, at the centre?) of a row that may not say where."""
+    return row if len(row) == 3 else (*row, False)
+
+
+def deviatoric(dim: int):
+    """Σ_ij (dev sym ∇v)_ij² entry by entry, with factors."""
+    for i, j in itertools.product(range(dim), repeat=2):
+        terms = [(i, j, 0.5), (j, i, 0.5)]
+        if i == j:
+            terms += [(k, k, -1 / dim) for k in range(dim)]
+        yield 1.0, terms
 
 
 @pytest.fixture

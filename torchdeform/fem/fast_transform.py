@@ -11,11 +11,16 @@ along the others, each set of frequencies (j_1, .., j_D) is a D×D block of its 
 stand on its diagonal, w_div C⊗Cᵀ − w_curl Cᵀ⊗C off it. Divided by Π μ, with λ = κ/μ, δ = w_div − w_curl, and t = s/μ
 across slip faces, −s/μ across tangential ones, it is
 
-    B = diag(d) + δ t tᵀ,   d_k = w_curl (Σ_{a≠k} λ_a + t_k²) + w_div r_k + w_zero,   r = λ − t² = ((1 − cos θ)/μ)² / 3,
+    B = diag(d) + δ t tᵀ,   d_k = w_curl (Σ_{a≠k} λ_a + t_k²) + w_div r_k + w_zero,   r = λ − t² = ((1 − cos θ)/μ)² / 3.
 
-inverted by the formula of Sherman and Morrison. With w_div = w_curl = w it is the number w Σ λ + w_zero, also where all
-of v vanishes on some faces: there C is antisymmetric, so the coupling is δ C⊗Cᵀ and goes with δ. All of this holds
-exactly for the discrete system.
+What is integrated at the centres (see `form.div_form`) with weights e_div and e_curl has μ̄ = h (1 + cos θ)/2 in place of
+μ, for which κ μ̄ = s². So it is
+
+    e_div g gᵀ + e_curl (|g|² − g gᵀ),   g_k² = λ_k Π_{a≠k} μ̄_a/μ_a,   with the signs of t.
+
+The formula of Sherman and Morrison inverts it all, once for t and once for g. With w_div = w_curl = w it is the number
+w Σ λ + w_zero, also where all of v vanishes on some faces: there C is antisymmetric, so the coupling is δ C⊗Cᵀ and goes
+with δ. All of this holds exactly for the discrete system.
 """
 
 import math
@@ -82,7 +87,8 @@ class TransformFactor(Factor):
         self.kinds = _kinds(resolve_boundary(boundary, grid.dim), grid.dim)
         self._like = self._workspace = like.detach().new_empty(0)
         symbols = [_Symbols(grid, axis, self._like) for axis in range(grid.dim)]
-        weights = (weights if weights.constant else weights.mean()).to(self._like)
+        weights = weights.without_strain(grid.dim)
+        weights = (weights if weights.constant else weights.typical()).to(self._like)
         coupled = transform_is_exact(grid, weights, boundary) and not weights.isotropic
         self._modes = _CoupledModes(symbols, weights, self.kinds) if coupled else _ScalarModes(symbols, weights)
         self._needs_grad = any(w.requires_grad for w in weights.tensors)
@@ -153,8 +159,8 @@ def transform_is_exact(grid: Grid, weights: Weights, boundary: Boundary) -> bool
         boundary: as `resolve_boundary`.
 
     Returns:
-        True for weights constant over space, opposite faces of one kind, no free face, and either w_div = w_curl or no
-        face where all of v is given; provided that K can be inverted at all.
+        True for weights constant over space without a strain, opposite faces of one kind, no free face, and either
+        w_div = w_curl or no face where all of v is given; provided that K can be inverted at all.
 
     Raises:
         InputError: as `resolve_boundary`.
@@ -164,7 +170,8 @@ def transform_is_exact(grid: Grid, weights: Weights, boundary: Boundary) -> bool
     paired = all(faces[Face(axis, 0)] == faces[Face(axis, 1)] for axis in range(grid.dim))
     # Between slip faces and one pair of tangential ones a constant field flows freely, and only w_zero holds it.
     held = all("sine" in along for along in _kinds(faces, grid.dim)) or weights.zero_positive
-    return weights.constant and paired and held and set(faces.values()) <= allowed
+    plain = not isinstance(weights.strain, Tensor) and weights.strain == 0
+    return weights.constant and plain and paired and held and set(faces.values()) <= allowed
 
 
 def _kinds(faces: dict[Face, str], dim: int) -> Kinds:
@@ -209,6 +216,8 @@ class _Symbols:
         versine, sine = 2 * (theta / 2).sin() ** 2, theta.sin()
         sine[-1] = 0.0
         mu = spacing * (3 - versine) / 3
+        mean = spacing * (theta / 2).cos() ** 2 / mu
+        mean[-1] = 0.0  # not 1e-33
         norm = torch.full_like(theta, (size - 1) / 2)
         norm[[0, -1]] = float(size - 1)
         shape = [1, 1, *(size if a == axis else 1 for a in range(grid.dim))]
@@ -216,6 +225,7 @@ class _Symbols:
         self.stiffness = (2 * versine / (spacing * mu)).view(shape).to(like)
         self.mixed = (sine / mu).view(shape).to(like)
         self.rest = ((versine / mu) ** 2 / 3).view(shape).to(like)
+        self.mean = mean.view(shape).to(like)
         self.lowest = float(self.stiffness.flatten()[1])
 
 
@@ -237,31 +247,65 @@ class _ScalarModes:
 
 
 class _CoupledModes:
-    """w_div ≠ w_curl: B⁻¹ b = y − (t/d) δ (t·y)/(1 + δ Σ t²/d) with y = b/d for every mode."""
+    """w_div ≠ w_curl: of a mode b, B⁻¹ b = A⁻¹ b − h γ (t·b) with h = A⁻¹ t for each δ t tᵀ added to a diagonal A."""
 
     def __init__(self, symbols: list[_Symbols], weights: Weights, kinds: Kinds) -> None:
+        (div, rest_div), (curl, rest_curl) = weights.parts
         signs = [1.0 if along[k] == "sine" else -1.0 for k, along in enumerate(kinds)]
         mixed = [s.mixed * sign for s, sign in zip(symbols, signs, strict=True)]
+        slopes = [_mean_slope(symbols, k) for k in range(len(symbols))]
+        centre = rest_curl * reduce(torch.add, [g**2 for g in slopes]) if _is_there(rest_curl) else 0.0
         diagonal = []
         for k, own in enumerate(symbols):
             others = reduce(torch.add, [own.mixed**2] + [s.stiffness for a, s in enumerate(symbols) if a != k])
-            d = weights.curl * others + weights.div * own.rest + weights.zero
-            diagonal.append(_held(d, weights, symbols))
-        delta = weights.div - weights.curl
-        squares = reduce(torch.add, [t**2 / d for t, d in zip(mixed, diagonal, strict=True)])
-        self.gain = delta / (1 + delta * squares)
-        self.mixed = mixed
-        self.inverse = torch.cat([1 / d for d in diagonal], dim=1)
+            diagonal.append(_held(curl * others + div * own.rest + centre + weights.zero, weights, symbols))
         self.mass = 1 / reduce(torch.mul, [s.mass for s in symbols])
+        self.inverse = torch.cat([1 / d for d in diagonal], dim=1)
+        self.updates: list[tuple[list[Tensor], list[Tensor], Tensor]] = []
+        self._update(mixed, div - curl)
+        if _is_there(rest_div - rest_curl):
+            means = [_where_waves(g * sign, kinds[k]) for k, (g, sign) in enumerate(zip(slopes, signs, strict=True))]
+            self._update(means, rest_div - rest_curl)
+
+    def _update(self, along: list[Tensor], delta: Tensor | float) -> None:
+        """Add δ t tᵀ, t being ``along`` the components."""
+        shape = torch.broadcast_shapes(self.inverse[:, :1].shape, *(t.shape for t in along))
+        solved = self._solve(torch.cat([t.expand(shape) for t in along], dim=1))
+        columns = [solved[:, k : k + 1] for k in range(len(along))]
+        gain = delta / (1 + delta * reduce(torch.add, [t * h for t, h in zip(along, columns, strict=True)]))
+        self.updates.append((along, columns, gain))
+
+    def _solve(self, modes: Tensor) -> Tensor:
+        modes = _scale(modes, self.inverse)
+        for along, columns, gain in self.updates:
+            # B⁻¹ b = y − h γ (t·y) with y = A⁻¹ b of the updates before.
+            size = gain * reduce(torch.add, [t * modes[:, k : k + 1] for k, t in enumerate(along)])
+            for k, column in enumerate(columns):
+                modes[:, k : k + 1].addcmul_(size, column, value=-1.0)
+        return modes
 
     def divide(self, modes: Tensor, power: int) -> Tensor:
         modes = _scale(modes, self.mass)
         for _ in range(power):
-            modes = _scale(modes, self.inverse)
-            along = self.gain * reduce(torch.add, [t * modes[:, k : k + 1] for k, t in enumerate(self.mixed)])
-            for k, t in enumerate(self.mixed):
-                modes[:, k : k + 1].addcmul_(along * t, self.inverse[:, k : k + 1], value=-1.0)
+            modes = self._solve(modes)
         return modes
+
+
+def _mean_slope(symbols: list[_Symbols], k: int) -> Tensor:
+    """Return √(λ_k Π_{a≠k} μ̄_a/μ_a), the derivative along k as the centres see it."""
+    return reduce(torch.mul, [s.stiffness if a == k else s.mean for a, s in enumerate(symbols)]).sqrt()
+
+
+def _where_waves(slope: Tensor, kinds: tuple[Kind, ...]) -> Tensor:
+    """Return the slope with 0 at the frequencies at which sines vanish."""
+    for axis, kind in enumerate(kinds, start=2):
+        if kind == "sine":
+            slope = slope.index_fill(axis, torch.tensor([0, slope.shape[axis] - 1], device=slope.device), 0.0)
+    return slope
+
+
+def _is_there(weight: Tensor | float) -> bool:
+    return isinstance(weight, Tensor) or weight != 0
 
 
 def _held(divisor: Tensor, weights: Weights, symbols: list[_Symbols]) -> Tensor:

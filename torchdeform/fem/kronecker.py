@@ -12,10 +12,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from torchdeform.core.grid import Grid, over_items
-from torchdeform.fem.elements import INTERVAL, Matrix
-
-# Per axis: is the test function differentiated, is the trial function?
-Factor = tuple[bool, bool]
+from torchdeform.fem.elements import INTERVAL, Factor, Matrix
 
 # One product: coefficient, output component, input component, one factor per axis.
 Product = tuple[float, int, int, tuple[Factor, ...]]
@@ -67,7 +64,7 @@ class _Apply(Function):
     @staticmethod
     def backward(ctx, *grads: Tensor):
         products, grid, _ = ctx.settings
-        transposed = tuple((c, j, i, tuple((b, a) for a, b in factors)) for c, i, j, factors in products)
+        transposed = tuple((c, j, i, tuple((b, a, mean) for a, b, mean in factors)) for c, i, j, factors in products)
         return apply_products(transposed, grads[0], grid, ctx.inputs), None, None, None
 
 
@@ -86,10 +83,10 @@ def _plan(products: tuple[Product, ...], spacing: tuple[float, ...]) -> dict[tup
 
 def _by_parts(factors: tuple[Factor, ...]) -> list[tuple[float, int | None, tuple[Factor, ...]]]:
     """Replace Cᵀ by E − C; a product of two first derivatives has at most one Cᵀ."""
-    if (False, True) not in factors:
+    if (False, True, False) not in factors:
         return [(1.0, None, factors)]
-    axis = factors.index((False, True))
-    expanded = (*factors[:axis], (True, False), *factors[axis + 1 :])
+    axis = factors.index((False, True, False))
+    expanded = (*factors[:axis], (True, False, False), *factors[axis + 1 :])
     return [(1.0, axis, expanded), (-1.0, None, expanded)]
 
 

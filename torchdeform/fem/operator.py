@@ -1,13 +1,14 @@
 """What a system needs of a form: its operator, right-hand sides and diagonal, each by the cheapest exact way."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import reduce
 
 import torch
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
-from torchdeform.fem.elements import at_corners, components, gauss_weight, row_table
+from torchdeform.fem.elements import Factor, at_corners, components, gauss_weight, row_table
 from torchdeform.fem.form import Coefficient, Form, Row
 from torchdeform.fem.kronecker import Product, apply_products
 from torchdeform.fem.quadrature import apply_by_quadrature, load_by_quadrature, scatter
@@ -37,13 +38,14 @@ def apply_form(form: Form, v: Tensor, grid: Grid) -> Tensor:
     return _sum_by_weight(form, lambda rows: apply_products(_energy(rows, grid.dim), v, grid, v.shape[1]))
 
 
-def assemble_load(form: Form, data: Tensor, grid: Grid) -> Tensor:
+def assemble_load(form: Form, data: Tensor, grid: Grid, channels: Sequence[int] | None = None) -> Tensor:
     """Return the right-hand side Σ_rows ∫ weight · data_row · row(N), data being Q1 between its nodal values.
 
     Args:
         form: the form.
         data: nodal values ``(B, R, *S)``, one channel per row of the form.
         grid: the grid.
+        channels: which channel each row has, where rows share them.
 
     Returns:
         ``(B, C, *S)``.
@@ -54,10 +56,12 @@ def assemble_load(form: Form, data: Tensor, grid: Grid) -> Tensor:
     Notes:
         Exact and differentiable as `apply_form`.
     """
-    grid.check(data, "assemble_load: data", components=len(form))
+    channels = range(len(form)) if channels is None else channels
+    grid.check(data, "assemble_load: data", components=1 + max(channels))
     if not _constant(form):
-        return load_by_quadrature(form, data, grid)
-    return _sum_by_weight(form, lambda rows: apply_products(_work(rows, grid.dim), data, grid, components(form)))
+        return load_by_quadrature(form, data, grid, channels)
+    count = components(form)
+    return _sum_by_weight(form, lambda rows: apply_products(_work(rows, channels, grid.dim), data, grid, count))
 
 
 def form_diagonal(form: Form, grid: Grid, like: Tensor) -> Tensor:
@@ -69,7 +73,7 @@ def form_diagonal(form: Form, grid: Grid, like: Tensor) -> Tensor:
 
 def _squares(row: Row, grid: Grid, count: int, device: torch.device) -> Tensor:
     """Return ∫ weight · row(N_i)² for every element, ``(B, count·2^D, *E)``."""
-    squares = row_table(row, grid, count, device) ** 2 * gauss_weight(grid)
+    squares = row_table(row, grid, count, device) ** 2 * gauss_weight(grid, row.centre)
     if isinstance(row.weight, Tensor) and row.weight.dim() > 0 and row.weight.shape[1] > 1:
         return (squares * at_corners(row.weight)).sum(1)
     # One weight per element: summing first keeps it from being spread over the Gauss points.
@@ -90,7 +94,7 @@ def _sum_by_weight(form: Form, apply: Callable[[_Rows], Tensor]) -> Tensor:
     groups: dict[int | None, tuple[Coefficient, _Rows]] = {}
     for index, row in enumerate(form):
         tensor = isinstance(row.weight, Tensor)
-        entry = (index, Row(1.0, row.terms) if tensor else row)
+        entry = (index, replace(row, weight=1.0) if tensor else row)
         groups.setdefault(id(row.weight) if tensor else None, (row.weight if tensor else 1.0, []))[1].append(entry)
     parts = [apply(rows) if key is None else weight * apply(rows) for key, (weight, rows) in groups.items()]
     return reduce(torch.add, parts)
@@ -103,7 +107,7 @@ def _energy(rows: Iterable[tuple[int, Row]], dim: int) -> tuple[Product, ...]:
             float(row.weight) * float(s.coefficient) * float(t.coefficient),
             s.component,
             t.component,
-            _factors(s.axis, t.axis, dim),
+            _factors(s.axis, t.axis, dim, row.centre),
         )
         for _, row in rows
         for s in row.terms
@@ -111,14 +115,19 @@ def _energy(rows: Iterable[tuple[int, Row]], dim: int) -> tuple[Product, ...]:
     )
 
 
-def _work(rows: Iterable[tuple[int, Row]], dim: int) -> tuple[Product, ...]:
-    """The products of row(N_i) with the values of the data, from row to component."""
+def _work(rows: Iterable[tuple[int, Row]], channels: Sequence[int], dim: int) -> tuple[Product, ...]:
+    """The products of row(N_i) with the values of the data, from channel to component."""
     return tuple(
-        (float(row.weight) * float(t.coefficient), t.component, index, _factors(t.axis, None, dim))
+        (
+            float(row.weight) * float(t.coefficient),
+            t.component,
+            channels[index],
+            _factors(t.axis, None, dim, row.centre),
+        )
         for index, row in rows
         for t in row.terms
     )
 
 
-def _factors(test: int | None, trial: int | None, dim: int) -> tuple[tuple[bool, bool], ...]:
-    return tuple((test == axis, trial == axis) for axis in range(dim))
+def _factors(test: int | None, trial: int | None, dim: int, centre: bool) -> tuple[Factor, ...]:
+    return tuple((test == axis, trial == axis, centre and axis not in (test, trial)) for axis in range(dim))

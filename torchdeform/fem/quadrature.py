@@ -1,7 +1,7 @@
 """Forms with any coefficients applied without a matrix: element by element, row by row at the Gauss points."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -34,13 +34,14 @@ def apply_by_quadrature(form: Form, v: Tensor, grid: Grid) -> Tensor:
     return _by_slabs(form, v, grid, evaluate)
 
 
-def load_by_quadrature(form: Form, data: Tensor, grid: Grid) -> Tensor:
+def load_by_quadrature(form: Form, data: Tensor, grid: Grid, channels: Sequence[int]) -> Tensor:
     """Return Σ_rows ∫ weight · data_row · row(N) for every test function N, data being Q1 between its nodal values.
 
     Args:
         form: the form.
-        data: nodal values ``(B, R, *S)``, one channel per row.
+        data: nodal values ``(B, R, *S)``.
         grid: the grid.
+        channels: which channel each row has.
 
     Returns:
         ``(B, C, *S)``.
@@ -48,7 +49,12 @@ def load_by_quadrature(form: Form, data: Tensor, grid: Grid) -> Tensor:
     Notes:
         As `apply_by_quadrature`.
     """
-    return _by_slabs(form, data, grid, lambda _, field, slab: list(interpolate(field, slab).unbind(1)))
+
+    def rows_of(local: Form, field: Tensor, slab: Grid) -> list[Tensor]:
+        found = {centre: interpolate(field, slab, centre) for centre in {row.centre for row in local}}
+        return [found[row.centre][:, channel] for channel, row in zip(channels, local, strict=True)]
+
+    return _by_slabs(form, data, grid, rows_of)
 
 
 def evaluate(form: Form, v: Tensor, grid: Grid) -> list[Tensor]:
@@ -60,25 +66,26 @@ def evaluate(form: Form, v: Tensor, grid: Grid) -> list[Tensor]:
         grid: the grid.
 
     Returns:
-        One ``(B, Q, *E)`` per row; Q = 2^D, E_a = n_a − 1.
+        One ``(B, Q, *E)`` per row; Q = 2^D, or 1 for a row at the centre, E_a = n_a − 1.
     """
     corners, elements = _corners(v), [n - 1 for n in grid.shape]
-    derivatives: dict[tuple[int, int | None], Tensor] = {}
+    derivatives: dict[tuple[int, int | None, bool], Tensor] = {}
     rows = []
     for row in form:
         total = None
         for coefficient, k, axis in row.terms:
-            if (k, axis) not in derivatives:
-                table = gauss_table(axis, grid.spacing, v.dtype, v.device)
-                derivatives[k, axis] = _product(table, corners[:, k]).unflatten(2, elements)
-            total = _plus(total, derivatives[k, axis], coefficient)
+            key = k, axis, row.centre
+            if key not in derivatives:
+                table = gauss_table(axis, grid.spacing, v.dtype, v.device, row.centre)
+                derivatives[key] = _product(table, corners[:, k]).unflatten(2, elements)
+            total = _plus(total, derivatives[key], coefficient)
         rows.append(total)
     return rows
 
 
-def interpolate(field: Tensor, grid: Grid) -> Tensor:
-    """Return nodal ``(B, C, *S)`` at the Gauss points of every element, ``(B, C, Q, *E)``."""
-    table = gauss_table(None, grid.spacing, field.dtype, field.device)
+def interpolate(field: Tensor, grid: Grid, centre: bool = False) -> Tensor:
+    """Return nodal ``(B, C, *S)`` at the Gauss points of every element, or at its centre, ``(B, C, Q, *E)``."""
+    table = gauss_table(None, grid.spacing, field.dtype, field.device, centre)
     values = _product(table, _corners(field).flatten(0, 1))
     return values.view(*field.shape[:2], -1, *[n - 1 for n in grid.shape])
 
@@ -94,15 +101,16 @@ def adjoint(form: Form, rows: list[Tensor], grid: Grid) -> Tensor:
     Returns:
         ``(B, C, *S)``.
     """
-    sums: dict[tuple[int, int | None], Tensor] = {}
+    sums: dict[tuple[int, int | None, bool], Tensor] = {}
     for row, values in zip(form, rows, strict=True):
         for coefficient, k, axis in row.terms:
-            sums[k, axis] = _plus(sums.get((k, axis)), values, coefficient)
-    batch = max(s.shape[0] for s in sums.values())
-    load = rows[0].new_zeros(batch, components(form), 2**grid.dim, *[n - 1 for n in grid.shape])
-    for (k, axis), values in sums.items():
-        table = gauss_table(axis, grid.spacing, load.dtype, load.device).T * gauss_weight(grid)
-        load[:, k] += _product(table, values.flatten(2)).view(values.shape)
+            key = k, axis, row.centre
+            sums[key] = _plus(sums.get(key), values, coefficient)
+    batch, elements = max(s.shape[0] for s in sums.values()), [n - 1 for n in grid.shape]
+    load = rows[0].new_zeros(batch, components(form), 2**grid.dim, *elements)
+    for (k, axis, centre), values in sums.items():
+        table = gauss_table(axis, grid.spacing, load.dtype, load.device, centre).T * gauss_weight(grid, centre)
+        load[:, k] += _product(table, values.flatten(2)).unflatten(2, elements)
     return scatter(load)
 
 

@@ -7,22 +7,21 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchdeform.core.derivatives import CURL_PAIRS
 from torchdeform.core.grid import Grid
 from torchdeform.fem.assembly import assemble, constrain_matrix
 from torchdeform.fem.boundary import Boundary, constrain, fixed_unknowns, lift
-from torchdeform.fem.form import Form, div_curl_form, value_form
+from torchdeform.fem.form import Form, curl_form, div_curl_form, div_form, value_form
 from torchdeform.fem.operator import apply_form, assemble_load, form_diagonal
 from torchdeform.fem.weights import Weights
 
 
 @dataclass(frozen=True)
 class DivCurlSystem:
-    """K v = load, the Q1 least squares of ∫ w_div (div v − α)² + w_curl |curl v − β|² + w_zero |v|² − 2 f·v.
+    """K v = load: least squares of ∫ w_div (div v − α)² + w_curl |curl v − β|² + w_s |dev sym ∇v|² + w_zero |v|² − 2 f·v.
 
     Args:
         grid: the grid of v.
-        weights: w_div, w_curl, w_zero.
+        weights: w_div, w_curl, w_zero, w_s.
         boundary: which components are given at which faces, see `resolve_boundary`; K acts on the others.
         also_fixed: mask ``(B or 1, D, *S)`` of unknowns that are given besides, None for none.
 
@@ -54,12 +53,16 @@ class DivCurlSystem:
         Returns:
             ``(B, D, *S)``; solvers leave out what it says about given unknowns.
         """
-        form = self._form(self.weights)
-        turns = len(CURL_PAIRS[self.grid.dim])
-        parts = [(form[:1], div), (form[1 : 1 + turns], curl), (value_form(self.grid.dim), force)]
-        rows = tuple(row for some, data in parts if data is not None for row in some)
-        given = [data for _, data in parts if data is not None]
-        load = assemble_load(rows, torch.cat(given, dim=1) if len(given) > 1 else given[0], self.grid)
+        dim = self.grid.dim
+        parts = [(div_form(dim, self.weights), div), (curl_form(dim, self.weights), curl), (value_form(dim), force)]
+        rows, channels, given = [], [], []
+        for some, data in parts:
+            if data is not None:
+                first = sum(d.shape[1] for d in given)
+                rows += some
+                channels += [first + k % data.shape[1] for k in range(len(some))]
+                given.append(data)
+        load = assemble_load(tuple(rows), torch.cat(given, dim=1) if len(given) > 1 else given[0], self.grid, channels)
         if values is None:
             return load
         return lift(lambda w: self._apply_all(w, self.weights), load, values, self.fixed(load.device))

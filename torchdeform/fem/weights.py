@@ -1,4 +1,4 @@
-"""The weights of the div-curl least squares: what a unit of divergence, of rotation and of velocity costs."""
+"""The weights of the div-curl least squares: what divergence, rotation, change of shape and velocity cost."""
 
 import math
 from dataclasses import dataclass, fields
@@ -11,16 +11,21 @@ from torchdeform.errors import InputError
 
 Weight = float | Tensor
 
+# How much dearer than the other divergence or curl may be before elements lock.
+_MOST_DEAR = 2.0
+
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of ∫ w_div (div v − α)² + w_curl |curl v − β|² + w_zero |v|².
+    """Weights of ∫ w_div (div v − α)² + w_curl |curl v − β|² + w_strain |dev sym ∇v|² + w_zero |v|².
 
     Args:
         div: w_div > 0. A number, or a tensor ``(B or 1, 1, *E)`` with one value per element, E_k = n_k − 1, or 1 where
             it does not vary.
-        curl: w_curl > 0, as ``div``.
+        curl: w_curl ≥ 0, as ``div``; positive where ``strain`` is 0.
         zero: w_zero ≥ 0 per squared unit of spacing, as ``div``; √(w_div / w_zero) is the length beyond which v decays.
+        strain: w_strain ≥ 0, as ``div``: the price of a change of shape, dev sym ∇v = (∇v + ∇vᵀ)/2 − (div v) I/D.
+            Where w_curl is 0 a rigid motion costs w_zero alone, whatever div and strain do.
 
     Raises:
         InputError: a number out of range (values of tensors are looked at by `check`).
@@ -29,11 +34,14 @@ class Weights:
     div: Weight = 1.0
     curl: Weight = 1.0
     zero: Weight = 0.0
+    strain: Weight = 0.0
 
     def __post_init__(self) -> None:
         for name, value in self._items():
             if not isinstance(value, Tensor):
                 _require_range(name, float(value), float(value))
+        if not isinstance(self.curl, Tensor) and not isinstance(self.strain, Tensor):
+            _require_held(self.curl + self.strain)
 
     def check(self, grid: Grid) -> None:
         """Raise `InputError` unless shapes fit the elements of ``grid`` and every value is in range."""
@@ -51,6 +59,8 @@ class Weights:
                     f"Weights: {name} must be a number or have shape (B, 1, {want}), got {tuple(value.shape)}"
                 )
             _require_range(name, *torch.stack(value.detach().aminmax()).tolist())
+        if self.tensors:
+            _require_held(float(torch.as_tensor(self.curl + self.strain).detach().amin()))
 
     @property
     def constant(self) -> bool:
@@ -59,7 +69,9 @@ class Weights:
 
     @property
     def isotropic(self) -> bool:
-        """True when w_div = w_curl for certain: tensors that agree while each wants its own gradient do not count."""
+        """True when w_div = w_curl, w_strain = 0 for certain: tensors that want gradients of their own do not count."""
+        if not isinstance(self.strain, float | int) or self.strain > 0:
+            return False
         if self.div is self.curl:
             return True
         tensors = [w for w in (self.div, self.curl) if isinstance(w, Tensor)]
@@ -74,9 +86,30 @@ class Weights:
         """True when w_zero > 0 everywhere."""
         return bool((self.zero > 0).all()) if isinstance(self.zero, Tensor) else self.zero > 0
 
-    def mean(self) -> "Weights":
-        """Return the weights averaged over the elements of each batch item."""
-        return Weights(**{name: _mean(w) for name, w in self._items()})
+    @property
+    def parts(self) -> tuple[tuple[Weight, Weight], tuple[Weight, Weight]]:
+        """What of w_div, and of w_curl, is integrated exactly, and what at the centres, see `form.div_form`.
+
+        Exactly: up to twice what the other costs.
+        """
+        return _parts(self.div, self.curl), _parts(self.curl, self.div)
+
+    def without_strain(self, dim: int) -> "Weights":
+        """Return the weights of div and curl alone that price fields without flow through the faces alike.
+
+        Constant weights given, ∫ |dev sym ∇v|² = ∫ (1 − 1/D) (div v)² + ½ |curl v|² for them.
+        """
+        if not isinstance(self.strain, Tensor) and self.strain == 0:
+            return self
+        return Weights(self.div + self.strain * (1 - 1 / dim), self.curl + self.strain / 2, self.zero)
+
+    def typical(self) -> "Weights":
+        """Return what each weight is at a quarter of the elements or below, for each batch item.
+
+        Those of the cheapest part of a map: a part that is dearer by any factor then takes few steps more, see
+        `FastTransform`, a thin one that is cheaper does not count.
+        """
+        return Weights(**{name: _quarter(w) for name, w in self._items()})
 
     def to(self, like: Tensor) -> "Weights":
         """Return the weights with tensors moved to the type and device of ``like``."""
@@ -84,7 +117,7 @@ class Weights:
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
-        """The weights that are tensors, in the order div, curl, zero."""
+        """The weights that are tensors, in the order of the fields."""
         return tuple(w for _, w in self._items() if isinstance(w, Tensor))
 
     def with_tensors(self, tensors: tuple[Tensor, ...]) -> "Weights":
@@ -96,14 +129,30 @@ class Weights:
         return [(f.name, getattr(self, f.name)) for f in fields(self)]
 
 
-def _mean(weight: Weight) -> Weight:
+def _parts(weight: Weight, other: Weight) -> tuple[Weight, Weight]:
+    if isinstance(weight, Tensor) or isinstance(other, Tensor):
+        like = weight if isinstance(weight, Tensor) else other
+        first, second = (torch.as_tensor(w, dtype=like.dtype, device=like.device) for w in (weight, other))
+        exact = torch.minimum(first, _MOST_DEAR * second)
+    else:
+        exact = min(weight, _MOST_DEAR * other)
+    return exact, weight - exact
+
+
+def _quarter(weight: Weight) -> Weight:
     if not isinstance(weight, Tensor) or weight.dim() == 0:
         return weight
-    return weight.mean(dim=tuple(range(1, weight.dim())), keepdim=True)
+    flat = weight.detach().flatten(1)
+    return flat.kthvalue(1 + flat.shape[1] // 4, dim=1).values.view(-1, *([1] * (weight.dim() - 1)))
+
+
+def _require_held(least: float) -> None:
+    if not least > 0:
+        raise InputError("Weights: curl must be finite and positive where strain is 0, got 0 for both")
 
 
 def _require_range(name: str, least: float, greatest: float) -> None:
-    large_enough = least >= 0 if name == "zero" else least > 0  # NaN is not
+    large_enough = least > 0 if name == "div" else least >= 0  # NaN is not
     if not large_enough or not greatest < math.inf:
-        wanted = "finite and at least 0" if name == "zero" else "finite and positive"
+        wanted = "finite and positive" if name == "div" else "finite and at least 0"
         raise InputError(f"Weights: {name} must be {wanted}, got {greatest if large_enough else least:g}")

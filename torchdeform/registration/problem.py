@@ -42,6 +42,8 @@ class Annotations:
         moving_points: the same landmarks in the moving image, in the same order.
         fixed_labels: whole numbers ``(B, 1, *S)``, 0 for what is not looked at; or an `Image` of them.
         moving_labels: likewise of the moving image. Labels are only measured.
+        tissue: whole numbers on the fixed image, as ``fixed_labels``; what they stand for say the settings ``tissues``
+            and ``sliding``.
 
     Raises:
         InputError: points or labels of one image only, or points whose shapes do not fit or that are not finite.
@@ -53,6 +55,7 @@ class Annotations:
     moving_points: Tensor | None = None
     fixed_labels: Tensor | Image | None = None
     moving_labels: Tensor | Image | None = None
+    tissue: Tensor | Image | None = None
 
     def __post_init__(self) -> None:
         for name in ("points", "labels"):
@@ -80,7 +83,7 @@ class Annotations:
 
     def require_tensors(self, grid: Grid, items: int) -> None:
         """Raise `InputError` unless everything given is a tensor that goes with images ``(items, C, *S)``."""
-        for name in ("fixed_mask", "moving_mask", "fixed_labels", "moving_labels"):
+        for name in ("fixed_mask", "moving_mask", "fixed_labels", "moving_labels", "tissue"):
             field = getattr(self, name)
             if field is not None:
                 _require_field(field, name, grid, items)
@@ -90,7 +93,7 @@ class Annotations:
 
     def require_images(self, dim: int) -> None:
         """Raise `InputError` unless masks and labels are images of ``dim`` axes, and points go with them."""
-        for name in ("fixed_mask", "moving_mask", "fixed_labels", "moving_labels"):
+        for name in ("fixed_mask", "moving_mask", "fixed_labels", "moving_labels", "tissue"):
             field = getattr(self, name)
             if field is None:
                 continue

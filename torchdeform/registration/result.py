@@ -13,6 +13,7 @@ from torchdeform.metrics.evaluation import Evaluation
 from torchdeform.registration.affine.align import Alignment
 from torchdeform.registration.evidence import Evidence
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.tissue import TissueOutcome
 from torchdeform.registration.verdict import Verdict, judge
 
 
@@ -87,6 +88,7 @@ class RegistrationResult:
         absent: where the similarity was let go, as nothing corresponds ``(B, 1, *S)``, from 0 to 1; None if nowhere.
         choice: a sentence on the similarity that was chosen; None where it was given.
         evidence: what the images and the map say, of each item.
+        tissue: how the labels of the tissue were kept; empty without.
         warnings: sentences about what looks wrong with the images.
         unit: what lengths are shown in.
     """
@@ -112,6 +114,7 @@ class RegistrationResult:
     absent: Tensor | None = None
     choice: str | None = None
     evidence: tuple[Evidence, ...] = ()
+    tissue: tuple[TissueOutcome, ...] = ()
     warnings: tuple[str, ...] = ()
     unit: str = "px"
 

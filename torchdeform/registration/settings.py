@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from torchdeform.core.flow import OdeSolver
 from torchdeform.core.image import AUTO
@@ -13,6 +13,15 @@ from torchdeform.registration.affine.settings import AlignmentSettings
 
 OFF = "off"
 STARTS = (AUTO, "identity", "discrete")
+
+# What the kinds of tissue cost, beside div 0.5, curl 1 and strain 0 of what is not named.
+TISSUES: dict[str, dict[str, float]] = {
+    "free": {},
+    "stiff": {"div": 20.0, "strain": 20.0, "curl": 0.0},
+    "rigid": {"div": 1e4, "strain": 1e4, "curl": 0.0},
+    "incompressible": {"div": 1e4},
+}
+PRICES = ("div", "strain", "curl")
 STENCILS = ("auto", "convolution", "shifts")
 
 
@@ -182,6 +191,24 @@ class DiscreteSettings:
         require_ranges(self, "discrete.", min_determinant="below 1")
 
 
+Tissue = str | Mapping[str, float]
+
+
+def require_tissue(label: int, tissue: Tissue) -> None:
+    """Raise `InputError` unless ``tissue`` is a kind of tissue, or prices of one."""
+    where = f"tissues: label {label}"
+    if not isinstance(tissue, Mapping):
+        require_choice(tissue, TISSUES, where)
+        return
+    for name, price in tissue.items():
+        require_choice(name, PRICES, where)
+        if not 0 <= price < math.inf or (name == "div" and price == 0):
+            wanted = "positive" if name == "div" else "at least 0"
+            raise InputError(f"{where}: {name} must be finite and {wanted}, got {price}")
+    if tissue.get("curl") == 0 and not tissue.get("strain"):
+        raise InputError(f"{where}: curl and strain must not both be 0, or it may take any shape")
+
+
 _ALIGN, _DISCRETE = AlignmentSettings(), DiscreteSettings()
 _SIMILARITY, _METRIC = SimilaritySettings(), MetricSettings()
 _SOLVER, _FLOW = SolverSettings(), OdeSolver(method="midpoint", steps=1)
@@ -218,6 +245,11 @@ class RegistrationSettings:
             surrounds it, the grey value of its border if that is nearly constant, else its minimum.
         absent: ``auto`` lets the similarity go of what only one image shows (resected, torn off, cut off); ``off``
             compares everything.
+        tissues: what the labels of ``Annotations.tissue`` stand for, by number: ``rigid`` (turns and moves, keeps its
+            shape), ``stiff`` (bends little), ``incompressible`` (keeps its volume, takes any shape), ``free``, or
+            prices of its own, such as ``{div: 100, strain: 10, curl: 0}``, in units of `MetricSettings`; what is left
+            out costs what it costs elsewhere. Labels that are not named are free.
+        sliding: labels whose border glides along what is around them.
 
     Raises:
         InputError: a value out of range, named.
@@ -237,8 +269,16 @@ class RegistrationSettings:
     symmetric: bool = False
     outside: float | str = AUTO
     absent: str | bool = AUTO
+    tissues: Mapping[int, Tissue] = field(default_factory=dict)
+    sliding: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "tissues", dict(self.tissues))
+        for label, tissue in self.tissues.items():
+            require_tissue(label, tissue)
+        for name in ("tissues", "sliding"):
+            if any(label <= 0 for label in getattr(self, name)):
+                raise InputError(f"{name}: labels are whole numbers from 1, as 0 is what has none")
         for name, key in SHORT_FORMS.items():
             value = getattr(self, name)
             if isinstance(value, str | Mapping):
@@ -253,6 +293,11 @@ class RegistrationSettings:
         else:
             require_ranges(self, "", outside=(math.isfinite, "be finite"))
         require_ranges(self, "", points_weight="finite, not negative")
+
+    @property
+    def knows_tissue(self) -> bool:
+        """Whether anything is said about tissue."""
+        return bool(self.tissues or self.sliding)
 
     @property
     def starts_discretely(self) -> bool:
