@@ -118,7 +118,7 @@ class TransformFactor(Factor):
         v = separable_transform(self._modes.divide(modes, power), self.kinds)
         return self.system.free(v) if masked else v
 
-    def solution(self, load: Tensor) -> Solution:
+    def solution(self, load: Tensor, start: Tensor | None = None) -> Solution:
         """Return v, with the residual that rounding leaves."""
         free = self.system.free(load)
         scale = magnitude(free)
