@@ -7,7 +7,7 @@ import torch
 
 from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
-from torchdeform.fem.weights import Weights
+from torchdeform.fem.weights import Weights, weights_of_labels
 
 GRID = Grid((4, 5))
 
@@ -70,3 +70,21 @@ def test_tensors_that_do_not_fit_are_refused(bad, message):
 
 def test_tensors_that_fit_are_taken():
     Weights(torch.ones(2, 1, 3, 4), torch.ones(1, 1, 1, 4), torch.tensor(0.0)).check(GRID)
+
+
+def test_labels_cost_what_they_are_said_to_and_their_border_is_soft():
+    labels = torch.zeros(2, 1, 4, 5, dtype=torch.int64)
+    labels[0, 0, :2] = 3
+    labels[1, 0, :, 4] = 7
+    prices = {3: Weights(100.0, 1.0, 0.2, 10.0), 7: Weights(0.5, 1.0, 0.2, 4.0), 9: Weights(1e4, 1.0, 0.2)}
+    weights = weights_of_labels(labels, prices, Weights(0.5, 1.0, 0.2), GRID)
+    weights.check(GRID)
+    assert (weights.curl, weights.zero) == (1.0, 0.2)
+    torch.testing.assert_close(weights.div[0, 0], torch.tensor([100.0, 50.25, 0.5]).view(3, 1).expand(3, 4))
+    torch.testing.assert_close(weights.strain[1, 0], torch.tensor([0.0, 0.0, 0.0, 2.0]).expand(3, 4))
+    torch.testing.assert_close(weights.div[1], torch.full((1, 3, 4), 0.5))
+
+
+def test_labels_that_do_not_fit_are_refused():
+    with pytest.raises(InputError, match=r"labels must have shape \(B, 1, 4, 5\), got \(1, 4, 5\)"):
+        weights_of_labels(torch.zeros(1, 4, 5), {}, Weights(), GRID)

@@ -4,6 +4,14 @@ from torchdeform.fem.boundary import Face
 from torchdeform.fem.div_curl import DivCurlSolution, solve_div_curl
 from torchdeform.fem.solver import SolverSettings
 from torchdeform.fem.system import DivCurlSystem
-from torchdeform.fem.weights import Weights
+from torchdeform.fem.weights import Weights, weights_of_labels
 
-__all__ = ["DivCurlSolution", "DivCurlSystem", "Face", "SolverSettings", "Weights", "solve_div_curl"]
+__all__ = [
+    "DivCurlSolution",
+    "DivCurlSystem",
+    "Face",
+    "SolverSettings",
+    "Weights",
+    "solve_div_curl",
+    "weights_of_labels",
+]

@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass
 
-from torchdeform.errors import require_choice, require_ranges
+from torchdeform.errors import InputError, require_choice, require_ranges
 from torchdeform.fem.fast_transform import FastTransform, is_exact_for
+from torchdeform.fem.stress import StressGuess, suits
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.solvers.base import LinearSolver
 from torchdeform.solvers.cg import ConjugateGradient, jacobi
@@ -11,7 +12,7 @@ from torchdeform.solvers.cg import ConjugateGradient, jacobi
 # A matrix of more entries (see `DivCurlSystem.matrix_entries`) is not assembled: that would take more than 6 GB.
 LARGEST_MATRIX = 2**26
 
-METHODS = ("auto", "transform", "cg", "assembled")
+METHODS = ("auto", "transform", "stress", "cg", "assembled")
 PRECONDITIONERS = {"transform": FastTransform(approximate=True).init, "jacobi": jacobi, "none": None}
 
 
@@ -53,6 +54,8 @@ def solver_of(settings: SolverSettings | str, system: DivCurlSystem) -> LinearSo
         InputError: an unknown name; `FastTransform.init` refuses ``transform`` where it is not exact.
     """
     how = settings if isinstance(settings, SolverSettings) else SolverSettings(method=settings)
+    if how.method == "stress" and not suits(system):
+        raise InputError("solver: stress is for weights of which some are far dearer than others; take auto or cg")
     if how.method == "transform" or (how.method == "auto" and is_exact_for(system)):
         return FastTransform(rtol=how.rtol, atol=how.atol)
     return ConjugateGradient(
@@ -61,4 +64,5 @@ def solver_of(settings: SolverSettings | str, system: DivCurlSystem) -> LinearSo
         rtol=how.rtol,
         atol=how.atol,
         max_steps=how.max_steps,
+        guess=StressGuess if how.method == "stress" or (how.method == "auto" and suits(system)) else None,
     )

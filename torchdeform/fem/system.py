@@ -1,6 +1,7 @@
 """The div-curl least squares as one linear system: its loads, products, diagonal and matrix."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,6 +11,7 @@ from torch import Tensor
 from torchdeform.core.grid import Grid
 from torchdeform.fem.assembly import assemble, constrain_matrix
 from torchdeform.fem.boundary import Boundary, constrain, fixed_unknowns, lift
+from torchdeform.fem.excess import Excess
 from torchdeform.fem.form import Form, curl_form, div_curl_form, div_form, value_form
 from torchdeform.fem.operator import apply_form, assemble_load, form_diagonal
 from torchdeform.fem.weights import Weights
@@ -89,6 +91,19 @@ class DivCurlSystem:
         """Return K v ``(B, D, *S)`` without a matrix, with ``parameters`` in place of the weights that are tensors."""
         weights = self.weights.with_tensors(parameters or self.weights.tensors)
         return constrain(lambda w: self._apply_all(w, weights), self.fixed(v.device))(v)
+
+    def product(self, like: Tensor) -> Callable[[Tensor], Tensor]:
+        """Return v ↦ K v for many v with the type and device of ``like``, with its own weights; without derivatives.
+
+        Notes:
+            What most elements have in common is applied as Kronecker products, what is beyond it on the others alone:
+            where few elements differ some five times faster than `apply`.
+        """
+        if self.weights.constant:
+            return self.apply
+        base = self.weights.to(like).base(self.grid.dim)
+        excess, form = Excess(self.grid, self.weights.to(like), base, like), self._form(base)
+        return constrain(lambda v: apply_form(form, v, self.grid) + excess.apply(v), self.fixed(like.device))
 
     def mass(self, v: Tensor) -> Tensor:
         """Return M v, M being the mass matrix on the free unknowns."""

@@ -1,6 +1,7 @@
 """The weights of the div-curl least squares: what divergence, rotation, change of shape and velocity cost."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 import torch
@@ -109,7 +110,11 @@ class Weights:
         Those of the cheapest part of a map: a part that is dearer by any factor then takes few steps more, see
         `FastTransform`, a thin one that is cheaper does not count.
         """
-        return Weights(**{name: _quarter(w) for name, w in self._items()})
+        return Weights(**{name: _share(w, 4) for name, w in self._items()})
+
+    def base(self, dim: int) -> "Weights":
+        """Return constant weights of div and curl alone, for each batch item: those of the cheapest sixteenth."""
+        return Weights(**{name: _share(w, 16) for name, w in self.without_strain(dim)._items()})
 
     def to(self, like: Tensor) -> "Weights":
         """Return the weights with tensors moved to the type and device of ``like``."""
@@ -129,6 +134,44 @@ class Weights:
         return [(f.name, getattr(self, f.name)) for f in fields(self)]
 
 
+def weights_of_labels(labels: Tensor, by_label: Mapping[int, Weights], rest: Weights, grid: Grid) -> Weights:
+    """Return the weights of tissues that are given as labels, soft over one voxel.
+
+    Args:
+        labels: whole numbers at the nodes ``(B, 1, *S)``.
+        by_label: what the labels cost, in numbers.
+        rest: what all other labels cost, in numbers.
+        grid: the grid.
+
+    Returns:
+        Weights by element ``(B, 1, *E)``, each the mean of what the corners cost, in the floating type of torch; a
+        number where all labels cost the same.
+
+    Raises:
+        InputError: shape.
+    """
+    if tuple(labels.shape[1:]) != (1, *grid.shape):
+        want = ", ".join(map(str, grid.shape))
+        raise InputError(f"weights_of_labels: labels must have shape (B, 1, {want}), got {tuple(labels.shape)}")
+    costs = {}
+    for field in fields(Weights):
+        values = {label: getattr(weights, field.name) for label, weights in by_label.items()}
+        costs[field.name] = other = getattr(rest, field.name)
+        if any(value != other for value in values.values()):
+            nodes = torch.full(labels.shape, float(other), device=labels.device)
+            for label, value in values.items():
+                nodes[labels == label] = value
+            costs[field.name] = _corner_mean(nodes)
+    return Weights(**costs)
+
+
+def _corner_mean(nodes: Tensor) -> Tensor:
+    for axis in range(2, nodes.dim()):
+        size = nodes.shape[axis] - 1
+        nodes = (nodes.narrow(axis, 0, size) + nodes.narrow(axis, 1, size)) / 2
+    return nodes
+
+
 def _parts(weight: Weight, other: Weight) -> tuple[Weight, Weight]:
     like = next((w for w in (weight, other) if isinstance(w, Tensor)), None)
     if like is not None:
@@ -139,11 +182,12 @@ def _parts(weight: Weight, other: Weight) -> tuple[Weight, Weight]:
     return exact, weight - exact
 
 
-def _quarter(weight: Weight) -> Weight:
+def _share(weight: Weight, parts: int) -> Weight:
+    """Return the smallest weight that at least one of so many parts of the elements has, or less."""
     if not isinstance(weight, Tensor) or weight.dim() == 0:
         return weight
     flat = weight.detach().flatten(1)
-    return flat.kthvalue(1 + flat.shape[1] // 4, dim=1).values.view(-1, *([1] * (weight.dim() - 1)))
+    return flat.kthvalue(1 + flat.shape[1] // parts, dim=1).values.view(-1, *([1] * (weight.dim() - 1)))
 
 
 def _require_held(least: float) -> None:

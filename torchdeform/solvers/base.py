@@ -1,6 +1,7 @@
 """What a linear solver is: it is made ready for a system once, then answers loads; failure is a value."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Protocol
@@ -89,6 +90,10 @@ class System(Protocol):
 
     def apply(self, v: Tensor, *parameters: Tensor) -> Tensor:
         """Return K(θ) v, without a matrix; with its own θ where none are given."""
+        ...
+
+    def product(self, like: Tensor) -> Callable[[Tensor], Tensor]:
+        """Return v ↦ K v, made ready for many v with the type and device of ``like``; without derivatives."""
         ...
 
     def free(self, load: Tensor) -> Tensor:

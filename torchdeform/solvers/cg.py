@@ -18,6 +18,10 @@ from torchdeform.solvers.base import Box, Factor, Solution, Status, System
 DEFAULT_RTOL = {torch.float32: 1e-5, torch.float64: 1e-10}
 
 
+# (b, tolerance (B,), max_steps) -> (x, steps (B,), which items are as near as they come (B,)).
+Guess = Callable[[Tensor, Tensor, int], tuple[Tensor, Tensor, Tensor]]
+
+
 @dataclass(frozen=True)
 class Operator:
     """A self-adjoint, positive definite x ↦ A(θ) x on each item of a batch.
@@ -43,6 +47,7 @@ def conjugate_gradient(
     rtol: float | None = None,
     atol: float = 0.0,
     max_steps: int = 1000,
+    guess: Guess | None = None,
 ) -> Solution:
     """Solve A x = b for each item until ‖b − A x‖ ≤ max(rtol ‖b‖, atol), with the Euclidean norm of that item.
 
@@ -54,6 +59,7 @@ def conjugate_gradient(
         rtol: relative tolerance, by default `DEFAULT_RTOL` of the dtype.
         atol: absolute tolerance.
         max_steps: steps at most for each item.
+        guess: another way to solve, which goes first; this one takes over where that fails, and checks its answer.
 
     Returns:
         `Solution`; the residual is computed anew from the result. An item that is not finite has the value NaN.
@@ -72,7 +78,7 @@ def conjugate_gradient(
     operator = operator if isinstance(operator, Operator) else Operator(operator)
     _check(b, x0, rtol, atol, max_steps)
     rtol = DEFAULT_RTOL[b.dtype] if rtol is None else rtol
-    settings = _Settings(preconditioner, rtol, atol, max_steps, watch=torch.is_grad_enabled())
+    settings = Settings(preconditioner, rtol, atol, max_steps, torch.is_grad_enabled(), guess)
     report = Box()
     value = _Implicit.apply(operator.apply, settings, x0, report, b, *operator.parameters)
     return replace(report.content, value=value)
@@ -90,6 +96,7 @@ class ConjugateGradient:
         rtol: relative tolerance, by default `DEFAULT_RTOL` of the dtype.
         atol: absolute tolerance.
         max_steps: steps at most for each item.
+        guess: ``(system, like) -> guess``, see `conjugate_gradient`; none when None.
     """
 
     assembled: bool = False
@@ -97,6 +104,7 @@ class ConjugateGradient:
     rtol: float | None = None
     atol: float = 0.0
     max_steps: int = 1000
+    guess: Callable[[Any, Tensor], Guess] | None = None
 
     def init(self, system: System, like: Tensor) -> "ConjugateGradientFactor":
         """Return the solver made ready for a system; ``assembled`` makes its matrix here.
@@ -104,26 +112,33 @@ class ConjugateGradient:
         Raises:
             InputError: with ``assembled``, coefficients that vary over the batch.
         """
-        precondition = None
-        if self.preconditioner is not None:
-            with torch.no_grad():
-                precondition = self.preconditioner(system, like)
-        assembled = self.assembled and not in_transformation()  # which knows no sparse matrices
-        product = _matrix_product(system, like) if assembled else system.apply
-        return ConjugateGradientFactor(self, system, product, precondition)
+        with torch.no_grad():
+            precondition = None if self.preconditioner is None else self.preconditioner(system, like)
+            guess = None if self.guess is None else self.guess(system, like)
+        return ConjugateGradientFactor(self, system, ready_product(system, like, self.assembled), precondition, guess)
 
 
-def _matrix_product(system: System, like: Tensor) -> Callable[..., Tensor]:
-    """Return v ↦ K v by the sparse matrix; where a derivative by θ is wanted, by the operator, which equals it."""
+def ready_product(system: System, like: Tensor, assembled: bool = False) -> Callable[..., Tensor]:
+    """Return v ↦ K(θ) v made ready for many products: by what the system has for that, or by its sparse matrix.
+
+    Where a derivative is wanted, or `torch.func` transforms, which knows neither, by the operator, which equals it.
+    """
+    if in_transformation():
+        return system.apply
     with torch.no_grad():
-        rows = to_csr(system.matrix(like.device).to(like.dtype))
+        quick = _matrix_product(system, like) if assembled else system.product(like)
 
     def product(v: Tensor, *parameters: Tensor) -> Tensor:
         if torch.is_grad_enabled() and any(p.requires_grad for p in (v, *parameters)):
             return system.apply(v, *parameters)
-        return (rows @ v.flatten(1).T).T.reshape(v.shape)
+        return quick(v)
 
     return product
+
+
+def _matrix_product(system: System, like: Tensor) -> Callable[[Tensor], Tensor]:
+    rows = to_csr(system.matrix(like.device).to(like.dtype))
+    return lambda v: (rows @ v.flatten(1).T).T.reshape(v.shape)
 
 
 def to_csr(matrix: Tensor) -> Tensor:
@@ -145,8 +160,10 @@ class ConjugateGradientFactor(Factor):
         system: System,
         product: Callable[..., Tensor],
         precondition: Callable[[Tensor], Tensor] | None,
+        guess: Guess | None,
     ) -> None:
-        self.solver, self.system, self.product, self.precondition = solver, system, product, precondition
+        self.solver, self.system, self.product = solver, system, product
+        self.precondition, self.guess = precondition, guess
 
     def solution(self, load: Tensor, start: Tensor | None = None) -> Solution:
         """Return v with K v = load, from ``start`` (zero when None) on; see `conjugate_gradient`."""
@@ -158,6 +175,7 @@ class ConjugateGradientFactor(Factor):
             rtol=self.solver.rtol,
             atol=self.solver.atol,
             max_steps=self.solver.max_steps,
+            guess=self.guess,
         )
 
     def __call__(self, load: Tensor, *, power: int = 1) -> Tensor:
@@ -182,12 +200,16 @@ def jacobi(system: System, like: Tensor) -> Callable[[Tensor], Tensor]:
 
 
 @dataclass(frozen=True)
-class _Settings:
+class Settings:
+    """As for `conjugate_gradient`; the ``norm`` of a residual, ``(B,)`` from ``(B, ...)``, is its length when None."""
+
     preconditioner: Callable[[Tensor], Tensor] | None
     rtol: float
-    atol: float
+    atol: float | Tensor
     max_steps: int
-    watch: bool
+    watch: bool = False
+    guess: Guess | None = None
+    norm: Callable[[Tensor], Tensor] | None = None
 
 
 def _check(b: Tensor, x0: Tensor | None, rtol: float | None, atol: float, max_steps: int) -> None:
@@ -203,9 +225,9 @@ class _Implicit(Function):
     """x = A(θ)⁻¹ b. From A dx = db − dA x and A = Aᵀ, a cotangent g of x is λ = A⁻¹ g for b and −λᵀ (∂A/∂θ) x for θ."""
 
     @staticmethod
-    def forward(apply, settings: _Settings, x0: Tensor | None, report: Box, b: Tensor, *parameters: Tensor):
+    def forward(apply, settings: Settings, x0: Tensor | None, report: Box, b: Tensor, *parameters: Tensor):
         operator = Operator(apply, tuple(p.detach() for p in parameters))
-        report.content = _solve(operator, b.detach(), x0, settings)
+        report.content = solve(operator, b.detach(), x0, settings)
         return report.content.value
 
     @staticmethod
@@ -270,18 +292,28 @@ _RUNNING, _MET, _BREAKDOWN, _NON_FINITE, _ROUNDING = range(5)
 _STATUS = (Status.MAX_STEPS, Status.CONVERGED, Status.BREAKDOWN, Status.NON_FINITE, Status.ROUNDING)
 
 
-def _solve(operator: Operator, b: Tensor, x0: Tensor | None, settings: _Settings) -> Solution:
+def solve(operator: Operator, b: Tensor, x0: Tensor | None, settings: Settings) -> Solution:
     """Descend, and again from the residual computed anew as long as that is worth it."""
     b, x, finite, scale = _scaled(b, x0)
-    norm = _norms(b)
+    length = settings.norm or norms
+    norm = length(b)
     tolerance = torch.maximum(settings.rtol * norm, settings.atol / scale.flatten())
+    steps = torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
     r = b.clone() if x0 is None else _residual(operator, b, x, settings)
-    before, steps = _norms(r), torch.zeros(b.shape[0], dtype=torch.int64, device=b.device)
+    before = length(r)
     code = torch.where(before <= tolerance, _MET, _RUNNING)
+    if settings.guess is not None:
+        change, steps, near = settings.guess(
+            torch.where(per_item(code == _MET, r), 0, r), tolerance, settings.max_steps
+        )
+        x = x + change
+        r = _residual(operator, b, x, settings)
+        before = length(r)
+        code = torch.where(near | (before <= tolerance), _MET, _RUNNING)
     while True:
         code = _descend(operator, settings, (x, r), tolerance, code, steps)
         r = _residual(operator, b, x, settings)
-        left = _norms(r)
+        left = length(r)
         missed = (code == _MET) & (left > tolerance)
         again = missed & (left < before / 2)
         code = torch.where(missed, torch.where(again, _RUNNING, _ROUNDING), code)
@@ -296,7 +328,7 @@ def _solve(operator: Operator, b: Tensor, x0: Tensor | None, settings: _Settings
     return Solution(value, tuple(_STATUS[c] for c in code.tolist()), steps, residual)
 
 
-def _residual(operator: Operator, b: Tensor, x: Tensor, settings: _Settings) -> Tensor:
+def _residual(operator: Operator, b: Tensor, x: Tensor, settings: Settings) -> Tensor:
     with torch.set_grad_enabled(settings.watch):
         product = operator(x)
     if product.requires_grad:
@@ -323,7 +355,7 @@ def _scaled(b: Tensor, x0: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tenso
 
 def _descend(
     operator: Operator,
-    settings: _Settings,
+    settings: Settings,
     state: tuple[Tensor, Tensor],
     tolerance: Tensor,
     code: Tensor,
@@ -331,6 +363,7 @@ def _descend(
 ) -> Tensor:
     """Run the recurrence on the items under way; change x, r and steps in place; return what became of the items."""
     x, r = state
+    length = settings.norm or norms
     p, rz = torch.zeros_like(r), torch.ones_like(tolerance)
     running = (code == _RUNNING) & (steps < settings.max_steps)
     while True in (alive := running.tolist()):
@@ -346,7 +379,7 @@ def _descend(
         alpha = per_item(torch.where(positive, rz / curvature, 0), p)
         x.addcmul_(p, alpha)
         r.addcmul_(q, alpha, value=-1)
-        left = _norms(r)
+        left = length(r)
         steps += running
         became = torch.where((left <= tolerance) | (rz == 0), _MET, torch.where(positive, _RUNNING, _BREAKDOWN))
         became = torch.where(torch.isfinite(curvature) & torch.isfinite(rz) & torch.isfinite(left), became, _NON_FINITE)
@@ -360,5 +393,6 @@ def dots(a: Tensor, b: Tensor) -> Tensor:
     return torch.stack([torch.dot(i.reshape(-1), j.reshape(-1)) for i, j in zip(a, b, strict=True)])
 
 
-def _norms(a: Tensor) -> Tensor:
+def norms(a: Tensor) -> Tensor:
+    """Return |a| for each item ``(B,)``."""
     return dots(a, a).sqrt()
