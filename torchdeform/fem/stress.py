@@ -33,10 +33,11 @@ def suits(system: DivCurlSystem) -> bool:
     """Tell whether some elements are far dearer than others, none much cheaper, and transforms invert the base."""
     if system.also_fixed is not None or system.weights.constant:
         return False
-    base, like = system.weights.base(system.grid.dim), next(w for w in system.weights.tensors if w.dim() > 0).detach()
+    weights = system.weights.detached()
+    base, like = weights.base(system.grid.dim), next(w for w in weights.tensors if w.dim() > 0)
     if not transform_is_exact(system.grid, base, system.boundary):
         return False
-    over = torch.stack([torch.stack(e.aminmax()) for e in excesses(system.weights, base, system.grid, like)]).detach()
+    over = torch.stack([torch.stack(e.aminmax()) for e in excesses(weights, base, system.grid, like)])
     scale = _scale(base)
     return bool((over[:, 0].amin() >= -1e-6 * scale) & (over[:, 1].amax() > _DEAR * scale))
 
@@ -54,7 +55,7 @@ class StressGuess:
     """
 
     def __init__(self, system: DivCurlSystem, like: Tensor) -> None:
-        weights = system.weights.to(like)
+        weights = system.weights.detached().to(like)
         base = weights.base(system.grid.dim)
         self.excess, scale = Excess(system.grid, weights, base, like), _scale(base)
         means, limit = [float(e.mean()) for e in self.excess.excess], scale / _SHARE

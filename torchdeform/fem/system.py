@@ -99,10 +99,11 @@ class DivCurlSystem:
             What most elements have in common is applied as Kronecker products, what is beyond it on the others alone:
             where few elements differ some five times faster than `apply`.
         """
-        if self.weights.constant:
-            return self.apply
-        base = self.weights.to(like).base(self.grid.dim)
-        excess, form = Excess(self.grid, self.weights.to(like), base, like), self._form(base)
+        weights = self.weights.detached().to(like)
+        if weights.constant:
+            return lambda v: self.apply(v, *weights.tensors)
+        base = weights.base(self.grid.dim)
+        excess, form = Excess(self.grid, weights, base, like), self._form(base)
         return constrain(lambda v: apply_form(form, v, self.grid) + excess.apply(v), self.fixed(like.device))
 
     def mass(self, v: Tensor) -> Tensor:

@@ -120,6 +120,10 @@ class Weights:
         """Return the weights with tensors moved to the type and device of ``like``."""
         return self.with_tensors(tuple(w.to(like) for w in self.tensors))
 
+    def detached(self) -> "Weights":
+        """Return the weights with tensors that want no gradient."""
+        return self.with_tensors(tuple(w.detach() for w in self.tensors))
+
     @property
     def tensors(self) -> tuple[Tensor, ...]:
         """The weights that are tensors, in the order of the fields."""
