@@ -57,8 +57,8 @@ def solve_div_curl(
         boundary: ``slip`` (n·v given), ``no_slip_tangential`` (n×v given), ``dirichlet`` (all of v given) or ``free``,
             for all faces or face by face, see `resolve_boundary`.
         boundary_values: ``(B, D, *S)``, what is given where; only its boundary nodes matter; 0 by default.
-        weights: w_div, w_curl, w_zero, constant or varying by element.
-        solver: ``auto``, ``transform``, ``cg`` or ``assembled``, or `SolverSettings`.
+        weights: w_div, w_curl, w_zero, constant or varying by element; and w_strain, see `Weights`.
+        solver: ``auto``, ``transform``, ``stress``, ``cg`` or ``assembled``, or `SolverSettings`.
         theta: in 3D, also return θ of curl v + ∇θ = β, which is 0 where β is a curl.
 
     Returns:
