@@ -19,6 +19,7 @@ from torchdeform.cli.options import (
     MovingPoints,
     Out,
     Quiet,
+    Tissue,
     Version,
     choice,
     flag,
@@ -78,6 +79,7 @@ def register(
     points_weight: PointsWeight = None,
     fixed_labels: FixedLabels = None,
     moving_labels: MovingLabels = None,
+    tissue: Tissue = None,
     symmetric: Symmetric = False,
     preset: Preset = "default",
     config: Config = None,
@@ -111,6 +113,7 @@ def register(
         moving_points=moving_points,
         fixed_labels=fixed_labels,
         moving_labels=moving_labels,
+        tissue=tissue,
     )
     limit = None if memory is None else parse_size(memory)
     with StepProgress(quiet) as bar:
