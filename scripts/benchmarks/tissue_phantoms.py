@@ -18,7 +18,7 @@ import torchdeform as td
 
 # A signed distance from a shape, and what a scene looks like: both of points (1, D, *S) in voxels, as (1, 1, *S).
 Distance = Callable[[Tensor], Tensor]
-_NOISE = 0.02  # standard deviation; tissue is about 0.5, bone 1
+_NOISE = 0.012  # standard deviation; tissue is about 0.5, bone 1
 _STEPS = 12  # of Runge-Kutta
 
 
@@ -84,11 +84,12 @@ def follow(bodies: Sequence[Body], width: float, rest: Callable[[Tensor], Tensor
     def velocity(x: Tensor, time: float) -> Tensor:
         far = [(body.distance(body.back(x, time)) - 1.0).clamp(min=0) for body in bodies]
         near = torch.stack(far).amin(0)
-        total = sum(((1 / (d + 1e-9)) for d in far), torch.zeros_like(near))
+        nearness = 1 / (torch.stack(far) + 1e-9)
+        shares = _smooth(nearness / nearness.sum(0))
         fade = _smooth(1 - near / width)
-        shares = [_smooth(1 / (d + 1e-9) / total) for d in far]
-        parts = [s * fade * body.velocity(x, time) for s, body in zip(shares, bodies, strict=True)]
-        return sum(parts, torch.zeros_like(x)) + (0 if rest is None else (1 - fade) * rest(x))
+        parts = [share * body.velocity(x, time) for share, body in zip(shares, bodies, strict=True)]
+        around = 0.0 if rest is None else (1 - fade) * rest(x)
+        return fade * torch.stack(parts).sum(0) + around
 
     return Motion(velocity)
 
@@ -147,7 +148,7 @@ def bones(dim: int = 2, seed: int = 1) -> Phantom:
         return value
 
     x = grid.points(dtype=torch.float64)
-    labels = sum(k * (bone(x) < 0).float() for k, bone in enumerate((femur, tibia), start=1))
+    labels = _labels(x, femur, tibia)
     settings = {"tissues": {1: "rigid", 2: "rigid"}}
     return _pair(f"bones {dim}D", grid, scene, scene, follow(bodies, 28 * scale), labels, settings, rng)
 
@@ -167,7 +168,8 @@ def lesion(dim: int = 2, seed: int = 1) -> Phantom:
     shift = torch.tensor(3 * direction / np.linalg.norm(direction))
     body = Body(blob, torch.zeros(dim, dim, dtype=torch.float64), middle, shift)
     drift = [_texture(grid, 14 * scale, rng) for _ in range(dim)]
-    textures = [_texture(grid, sigma, rng) for sigma in (1.8, 4.0, 1.5)]
+    fine = 1.8 if dim == 2 else 1.3
+    textures = [_texture(grid, sigma, rng) for sigma in (fine, 2.2 * fine, fine, 2.2 * fine)]
 
     def window(x: Tensor) -> Tensor:
         return torch.sin(math.pi * (x / (n - 1)).clamp(0, 1)).prod(1, keepdim=True)
@@ -176,12 +178,12 @@ def lesion(dim: int = 2, seed: int = 1) -> Phantom:
         return 1.2 * scale * window(x) * torch.cat([part(x) for part in drift], dim=1)
 
     def scene(x: Tensor, enhanced: float = 0.0) -> Tensor:
-        fine, coarse, own = (texture(x) for texture in textures)
+        small, coarse, own, large = (texture(x) for texture in textures)
         d = blob(x)
-        value = torch.lerp(0.42 + 0.08 * fine + 0.12 * coarse, 0.62 + 0.07 * own, _inside(d, 2.0))
-        return value * (1 + enhanced * _inside(d, 3.0))
+        value = torch.lerp(0.4 + 0.06 * small + 0.09 * coarse, 0.7 + 0.05 * own + 0.05 * large, _inside(d, 2.0))
+        return value * (1 + enhanced * _inside(d - 0.5, 3.0))
 
-    labels = (blob(grid.points(dtype=torch.float64)) < 0).float()
+    labels = _labels(grid.points(dtype=torch.float64), blob)
     settings = {"tissues": {1: "incompressible"}}
     motion = follow([body], 30 * scale, rest)
     return _pair(f"lesion {dim}D", grid, scene, lambda x: scene(x, 0.6), motion, labels, settings, rng)
@@ -202,10 +204,11 @@ def blocks(dim: int = 2, seed: int = 1, shape: str = "flat") -> Phantom:
         return value
 
     x = grid.points(dtype=torch.float64)
-    labels = sum(k * (part.distance(x) < 0).float() for k, part in enumerate(parts, start=1))
-    truth = sum((part.distance(x) < 0) * (part.back(x, -1.0) - x) for part in parts)
-    images = [_noisy(scene(x, time), rng) for time in (0.0, 1.0)]
-    return Phantom(f"blocks {dim}D, {shape}", *images, labels.float(), truth.float(), {"sliding": [1]})
+    labels = _labels(x, *(part.distance for part in parts))
+    moved = [(labels == k) * (part.back(x, -1.0) - x) for k, part in enumerate(parts, start=1)]
+    truth = torch.stack(moved).sum(0)
+    images = _noisy(scene(x, 0.0), rng), _noisy(scene(x, 1.0), rng)
+    return Phantom(f"blocks {dim}D, {shape}", *images, labels, truth.float(), {"sliding": [1]})
 
 
 def breathing(dim: int = 2, seed: int = 1) -> Phantom:
@@ -249,7 +252,7 @@ def breathing(dim: int = 2, seed: int = 1) -> Phantom:
     inside = cavity(x) < 0
     here, there = (torch.lerp(wall(x), inner(at), _inside(cavity(x))) for at in (x, motion.back(x)))
     truth = inside * (motion.forth(x) - x)
-    images = [_noisy(values, rng) for values in (here, there)]
+    images = _noisy(here, rng), _noisy(there, rng)
     return Phantom(f"breathing {dim}D", *images, inside.float(), truth.float(), {"sliding": [1]})
 
 
@@ -295,14 +298,14 @@ def _pair(
     fixed: Distance,
     moving: Distance,
     motion: Motion,
-    labels: Any,
+    labels: Tensor,
     settings: Mapping[str, Any],
     rng: np.random.Generator,
 ) -> Phantom:
     """Return the phantom of a scene before and after a motion."""
     x = grid.points(dtype=torch.float64)
-    images = [_noisy(values, rng) for values in (fixed(x), moving(motion.back(x)))]
-    return Phantom(name, *images, labels.float(), (motion.forth(x) - x).float(), settings)
+    images = _noisy(fixed(x), rng), _noisy(moving(motion.back(x)), rng)
+    return Phantom(name, *images, labels, (motion.forth(x) - x).float(), settings)
 
 
 def _long_bone(start: Tensor, end: Tensor, radius: float, bulge: float) -> Distance:
@@ -322,6 +325,11 @@ def _long_bone(start: Tensor, end: Tensor, radius: float, bulge: float) -> Dista
 
 def _union(*shapes: Distance) -> Distance:
     return lambda x: torch.stack([shape(x) for shape in shapes]).amin(0)
+
+
+def _labels(x: Tensor, *shapes: Distance) -> Tensor:
+    """Return the number of the shape that a node is in, from 1; 0 for none."""
+    return torch.stack([k * (shape(x) < 0).float() for k, shape in enumerate(shapes, start=1)]).sum(0)
 
 
 def _skew(dim: int, angle: float, rng: np.random.Generator) -> Tensor:
