@@ -42,7 +42,7 @@ from torchdeform.registration.symmetric import (
     midspace_of_tensors,
     optimise_symmetric,
 )
-from torchdeform.registration.tissue import Tissue
+from torchdeform.registration.tissue import Tissue, TissueOutcome
 
 
 @torch.no_grad()
@@ -238,6 +238,7 @@ class _Optimised:
     objective: tuple[Tensor, ...]
     marks: tuple[Tensor, ...]
     seconds: float
+    tissue: tuple[TissueOutcome, ...]
 
 
 def _optimise(
@@ -264,13 +265,17 @@ def _optimise(
         u, records = optimise_sides(problem, settings, start, callback)
     else:
         u, records = optimise_levels(problem, settings, start, callback)
+    kept: tuple[TissueOutcome, ...] = ()
     with limit_threads(len(u), problem.grid):
+        if problem.tissue is not None:
+            u, kept = problem.tissue.corrected(u, problem.grid, settings.folds.min_determinant)
+            u = repair_folds(u, problem.grid)
         objective = forward_objective(problem, problem.grid, settings)
         zero = torch.zeros_like(u)
         u, after, before = best_map(objective, settings, u, *([] if start is None else [start]), zero)
         values = before, after
         marks = values if settings.similarity.measure == "lncc" else _marks(problem, settings, zero, u)
-    return _Optimised(u, records, values, marks, perf_counter() - began)
+    return _Optimised(u, records, values, marks, perf_counter() - began, kept)
 
 
 def _marks(problem: RegistrationProblem, settings: RegistrationSettings, *maps: Tensor) -> tuple[Tensor, ...]:
@@ -314,6 +319,7 @@ def _result(found: _Optimised, grid: Grid, warped: Tensor, settings: Registratio
             levels=found.records,
             seconds={"register": found.seconds, "invert": inverted - start, "diagnose": perf_counter() - inverted},
             settings=settings,
+            tissue=found.tissue,
         )
 
 

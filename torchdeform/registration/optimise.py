@@ -16,6 +16,7 @@ from torchdeform.core.fold_free import largest_share, repair_folds, smooth_elast
 from torchdeform.core.grid import Grid, limit_threads, per_item
 from torchdeform.core.resampling import Transfer, coarsened, prolong, pyramid_grids
 from torchdeform.core.warp import compose, warp
+from torchdeform.deformation.rigid import RigidHold
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity, weighted
 from torchdeform.metrics.similarity import features, make_similarity
@@ -155,6 +156,7 @@ class Level:
         keep_best: end at the best map that was met, and stop where nothing is gained; otherwise make all steps.
         held: axes along which nothing is moved, from 0.
         tissue: what the fixed image is made of, on the grid of the map.
+        hold: makes maps rigid again where the tissue is.
     """
 
     objective: Objective
@@ -167,6 +169,7 @@ class Level:
     keep_best: bool = True
     held: tuple[int, ...] = ()
     tissue: Tissue | None = None
+    hold: RigidHold | None = None
 
     @property
     def grid(self) -> Grid:
@@ -272,6 +275,7 @@ def make_level(
         transfer=Transfer(problem.grid, grid, problem.fixed) if grid != problem.grid else None,
         held=problem.held,
         tissue=tissue,
+        hold=None if tissue is None else tissue.hold(grid),
     )
 
 
@@ -386,7 +390,7 @@ def fold_free_step(level: Level, state: State, v: Tensor) -> tuple[Tensor, Tenso
     settings, grid = level.settings, level.grid
     floor = state.lowest.flatten(1).amin(1).clamp(max=settings.folds.min_determinant)
     u, lowest = state.u, state.lowest
-    free, holds = level.tissue and level.tissue.free, None
+    free = None if level.tissue is None else level.tissue.free
 
     def accept(share: Tensor) -> Tensor:
         nonlocal u, lowest
@@ -394,8 +398,8 @@ def fold_free_step(level: Level, state: State, v: Tensor) -> tuple[Tensor, Tenso
         if settings.metric.elasticity > 0:
             moved = per_item(settings.metric.elasticity * share * state.active, u)
             u = smooth_elastically(u, moved if free is None else moved * free, grid)
-        if holds is not None:
-            u = holds.hold(u)
+        if level.hold is not None:
+            u = level.hold(u, floor)
         lowest = one_sided_determinant(u, grid)
         return level.objective.coupling.all(lowest.flatten(1).amin(1) >= floor)
 

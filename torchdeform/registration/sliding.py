@@ -5,7 +5,6 @@ divergence. The loop sees a batch of as many maps as there are sides, each compa
 map goes on smoothly, and in the end every node takes that of its own side.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch

@@ -9,9 +9,12 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import restrict
+from torchdeform.deformation.rigid import RigidHold
+from torchdeform.deformation.tissue import label_fit
 from torchdeform.errors import InputError
 from torchdeform.fem.weights import Weights
 from torchdeform.registration.settings import TISSUES, RegistrationSettings
+
 
 @dataclass(frozen=True)
 class TissueFit:
@@ -97,10 +100,27 @@ class Tissue:
         """Return the same on a coarser grid of the same box."""
         return self if grid == coarse else replace(self, shares=restrict(self.shares, grid, coarse))
 
-    def masks(self, *kinds: str) -> Tensor:
-        """Return the nodes of the labels of some kinds ``(B or 1, L', *S)``, bool; each node in one label at most."""
-        wanted = [k for k, kind in enumerate(self.kinds) if kind in kinds]
-        return self.shares[:, wanted] > 0.5
+    def masks(self, kind: str) -> Tensor:
+        """Return the nodes of the labels of a kind ``(B or 1, L', *S)``, bool; each node in one label at most."""
+        return self.shares[:, [k for k, one in enumerate(self.kinds) if one == kind]] > 0.5
+
+    def corrected(self, u: Tensor, grid: Grid, floor: float) -> tuple[Tensor, tuple[TissueOutcome, ...]]:
+        """Return maps ``(B, D, *S)`` that keep shapes and volumes as asked for, and how well before and after that."""
+        found = [(self._fits(u, grid))]
+        if (hold := self.hold(grid)) is not None:
+            u = hold(u, floor)
+        found.append(self._fits(u, grid))
+        nodes = (self.shares > 0.5).flatten(2).sum(2).expand(len(u), -1)
+        named = zip(self.labels, self.kinds, self.sliding, nodes.unbind(1), *found, strict=True)
+        return u, tuple(TissueOutcome(*one) for one in named)
+
+    def _fits(self, u: Tensor, grid: Grid) -> list[TissueFit]:
+        return [TissueFit(*label_fit(u, label, grid)) for label in (self.shares > 0.5).split(1, dim=1)]
+
+    def hold(self, grid: Grid) -> RigidHold | None:
+        """Return what keeps the rigid labels rigid, None where there are none."""
+        masks = self.masks("rigid")
+        return RigidHold(masks, grid) if bool(masks.any()) else None
 
     def weights(self, base: Weights) -> Weights:
         """Return what a velocity costs in each element, ``base`` where there is no label."""
