@@ -3,7 +3,10 @@
 import math
 from pathlib import Path
 
+import torch
+
 import torchdeform as td
+from torchdeform.core.warp import sample
 from torchdeform.report.contours import outlines
 from torchdeform.report.drawing import (
     CURVES,
@@ -21,7 +24,7 @@ from torchdeform.report.sheet import TITLE, Sheet, title
 
 RUNS = ("without", "with")  # the folders of the two results
 _WIDTH = 2.6  # inches of a panel
-_LINES = 44
+_LINES = 36
 
 
 def compare(folder: Path) -> Path:
@@ -36,12 +39,17 @@ def compare(folder: Path) -> Path:
     for row, image, run, found in zip(sheet.panels, ("fixed", "moving"), RUNS, maps, strict=True):
         grey, u = images[image].data[0].clamp(0, 1), found.field.data.float()
         draw_image(row[0], plane, grey)
-        draw_faint(row[1], plane, images["fixed"].data[0].clamp(0, 1))
+        draw_faint(row[1], plane, images["moving"].data[0].clamp(0, 1))
         draw_lines(row[1], plane, u[0], _LINES)
         volume = td.jacobian_determinant(u, grid)[0].clamp(min=1e-3).log()
         shown = draw_map(row[2], plane, volume, scale)
-        for panel in row if image == "fixed" else row[1:]:
-            draw_lines_over(panel, border, CURVES[2])
+        moved = [
+            line + sample(u, torch.from_numpy(line.T[::-1].copy())[None].float(), grid)[0].flip(0).T.numpy()
+            for line in border
+        ]
+        shapes = (border if image == "fixed" else [], moved, border)
+        for panel, lines in zip(row, shapes, strict=True):
+            draw_lines_over(panel, lines, CURVES[2])
         for panel, text in zip(row, (image, f"grid, {run} tissue", f"determinant, {run} tissue"), strict=True):
             title(panel, text)
         if run == RUNS[-1]:
