@@ -20,6 +20,7 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, resample
 from torchdeform.errors import ComputationError
 from torchdeform.io import read_displacement, read_image, write_image
+from torchdeform.registration.tissue import TissueFit, TissueOutcome
 
 RESULTS = ["displacement.nii.gz", "inverse.h5", "overview.png", "report.html", "result.json", "transform.h5"]
 
@@ -276,17 +277,32 @@ PAIR = ["fixed.png", "moving.png"]
 WITH_TISSUE = [*PAIR, "--tissue", "tissue.png"]
 
 
-def test_tissue_goes_to_the_engine_and_into_the_command(folder, engine, make_result):
-    seen = []
+def test_tissue_goes_to_the_engine_and_into_summary_and_command(folder, engine, make_result, capsys):
+    seen, nodes = [], torch.tensor([35])
+    kept = TissueFit(*torch.tensor([[0.0213], [0.0081], [1.0002]])), TissueFit(*torch.tensor([[0.3], [0.04], [0.98]]))
+    known = (
+        TissueOutcome(1, "rigid", False, nodes, kept[1], kept[0]),
+        TissueOutcome(3, "incompressible", True, nodes, kept[1], kept[0]),
+        TissueOutcome(5, "stiff", False, nodes, *[kept[0]] * 2),
+        TissueOutcome(7, "free", True, nodes, *[kept[0]] * 2),
+    )
 
     def register(*images, annotations, **more):
         seen.append(annotations.tissue.data.unique().tolist())
-        return make_result(*images, annotations=annotations, **more)
+        return replace(make_result(*images, annotations=annotations, **more), tissue=known)
 
     engine.register = register
     _tissue(1, 3)()
     how = ["--set", "tissues.1=rigid", "--set", "tissues.3={div: 50, strain: 5}", "--set", "sliding=3", "--out", "out"]
-    assert main([*WITH_TISSUE, *how, "--quiet"]) == 0
+    assert main([*WITH_TISSUE, *how]) == 0
+    out = capsys.readouterr().out
+    for line in (
+        "tissue 1 (rigid)                    0.3 -> 0.0213 voxel off a rigid motion",
+        "tissue 3 (incompressible, sliding)  determinant within 4 % -> 0.81 %, volume -2 % -> +0.02 %",
+        "tissue 5 (stiff)                    0.0213 voxel off a rigid motion, volume +0.02 %",
+        "tissue 7 (free, sliding)            volume +0.02 %",
+    ):
+        assert line in out
     first = json.loads((folder / "out" / "result.json").read_text(encoding="utf-8"))
     assert first["inputs"]["tissue"] == "tissue.png"
     assert first["settings"]["tissues"] == {"1": "rigid", "3": {"div": 50.0, "strain": 5.0}}

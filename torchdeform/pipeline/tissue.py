@@ -25,7 +25,7 @@ def contradiction(given: bool, settings: RegistrationSettings, option: str = "--
             f"tissues and sliding name labels ({names}), but there is no {option}; give the labels of the fixed image"
         )
     if settings.knows_tissue and settings.symmetric:
-        return "symmetric: tissue is known of the fixed image only, so tissues and sliding do not go with it; leave out one"
+        return "symmetric: tissue is known of the fixed image only, so tissues and sliding do not go with it; drop one"
     return ""
 
 

@@ -23,6 +23,7 @@ from torchdeform.registration.landmarks import ForwardLandmarks, Landmarks
 from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.result import Callback, LevelRecord, Progress
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.tissue import Tissue
 from torchdeform.registration.velocity import (
     LAST_STEP,
     VelocityMetric,
@@ -56,6 +57,10 @@ class Coupling:
     def all(self, flags: Tensor) -> Tensor:
         """Return for each map whether all that move together are flagged, ``(B,)``."""
         return flags
+
+    def together(self, sizes: Tensor) -> Tensor:
+        """Return for each map the largest size ``(B,)`` of those that are scaled together."""
+        return sizes
 
 
 _FREE = Coupling()
@@ -149,6 +154,7 @@ class Level:
         transfer: between the grid of the images and that of the map, None where they are one.
         keep_best: end at the best map that was met, and stop where nothing is gained; otherwise make all steps.
         held: axes along which nothing is moved, from 0.
+        tissue: what the fixed image is made of, on the grid of the map.
     """
 
     objective: Objective
@@ -160,6 +166,7 @@ class Level:
     transfer: Transfer | None = None
     keep_best: bool = True
     held: tuple[int, ...] = ()
+    tissue: Tissue | None = None
 
     @property
     def grid(self) -> Grid:
@@ -254,15 +261,17 @@ def make_level(
 ) -> Level:
     """Return level ``index`` of so many, from the problem on its grid."""
     grid, below = _map_grid(problem.grid, settings), levels - 1 - index
+    tissue = problem.tissue and problem.tissue.on(problem.grid, grid)
     return Level(
         objective=objective(problem, grid, settings),
-        metric=VelocityMetric.of(grid, settings.metric, settings.solver, problem.fixed, below),
+        metric=VelocityMetric.of(grid, settings.metric, settings.solver, problem.fixed, below, tissue),
         settings=settings,
         steps=steps_on(problem.grid, settings.optimiser.steps[index - levels], settings),
         index=index,
         levels=levels,
         transfer=Transfer(problem.grid, grid, problem.fixed) if grid != problem.grid else None,
         held=problem.held,
+        tissue=tissue,
     )
 
 
@@ -343,10 +352,11 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     # 3. Least squares: div and curl of the velocity are paid for, nearly folded places ask for divergence.
     barrier = fold_barrier(state.lowest, settings.folds.soft_determinant)
     force, load = held_still(force, level.held), None if load is None else held_still(load, level.held)
-    v = held_still(level.metric.ascent(force, barrier, load), level.held)
-    v = normalise_step(objective.coupling.velocity(v), grid)
+    coupling = objective.coupling
+    v = held_still(level.metric.ascent(force, barrier, load, coupling.together), level.held)
+    v = normalise_step(coupling.velocity(v), grid, coupling.together)
     direction = v + settings.optimiser.momentum * state.direction
-    v = normalise_step(direction, grid)
+    v = normalise_step(direction, grid, coupling.together)
     # 4. and 5. Flow and guard: φ ← φ ∘ flow(v), no farther than where a determinant becomes too small.
     size = v.new_full((len(v),), step_size(settings.optimiser, step, level.steps))
     if points is not None:
@@ -376,12 +386,16 @@ def fold_free_step(level: Level, state: State, v: Tensor) -> tuple[Tensor, Tenso
     settings, grid = level.settings, level.grid
     floor = state.lowest.flatten(1).amin(1).clamp(max=settings.folds.min_determinant)
     u, lowest = state.u, state.lowest
+    free, holds = level.tissue and level.tissue.free, None
 
     def accept(share: Tensor) -> Tensor:
         nonlocal u, lowest
         u = compose(state.u, flow(v * per_item(share, v), grid, settings.flow), grid)
         if settings.metric.elasticity > 0:
-            u = smooth_elastically(u, settings.metric.elasticity * share * state.active, grid)
+            moved = per_item(settings.metric.elasticity * share * state.active, u)
+            u = smooth_elastically(u, moved if free is None else moved * free, grid)
+        if holds is not None:
+            u = holds.hold(u)
         lowest = one_sided_determinant(u, grid)
         return level.objective.coupling.all(lowest.flatten(1).amin(1) >= floor)
 
