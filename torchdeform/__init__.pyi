@@ -56,6 +56,7 @@ from .registration.settings import (
     RegistrationSettings,
 )
 from .registration.template import AveragingSettings, Template, build_template
+from .registration.tissue import TissueFit, TissueOutcome
 from .registration.verdict import Finding, Verdict
 from .solvers.base import Solution, Status
 
@@ -66,8 +67,8 @@ __all__ = [
     "Affine", "Alignment", "AlignmentSettings", "Annotations", "AveragingSettings", "ComputationError",
     "DeformationSettings", "Diagnosis", "DiscreteSettings", "Displacement", "Evaluation", "Evidence", "Finding", "Grid",
     "Image", "InputError", "Measures", "MonitorSettings", "NewtonSettings", "OdeSolver", "RegistrationResult",
-    "RegistrationSettings", "Solution", "SolverSettings", "Status", "Template", "TorchdeformError", "Transform",
-    "Verdict", "Weights", "align",
+    "RegistrationSettings", "Solution", "SolverSettings", "Status", "Template", "TissueFit", "TissueOutcome",
+    "TorchdeformError", "Transform", "Verdict", "Weights", "align",
     "average_maps", "ball_monitor", "box_monitor", "build_template", "compose", "curl", "curvature_monitor",
     "density_monitor", "diagnose", "dice", "discrete_start", "divergence", "find_velocity", "from_jacobian_and_curl",
     "gradient_monitor", "grid_from_initial_monitor", "grid_from_target_monitor", "hausdorff", "integrate", "invert",

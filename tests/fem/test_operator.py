@@ -3,17 +3,31 @@
 import pytest
 import torch
 from forms import GRIDS, WEIGHTS, close, element_values, random_field, random_form
+from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
 from torchdeform.core.derivatives import CURL_PAIRS
 from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.fem.assembly import assemble
-from torchdeform.fem.form import Row, Term, div_curl_form
+from torchdeform.fem.form import Form, Row, Term, curl_form, div_curl_form, div_form
 from torchdeform.fem.operator import apply_form, assemble_load, form_diagonal
 from torchdeform.fem.quadrature import apply_by_quadrature, load_by_quadrature
 from torchdeform.fem.weights import Weights
 from torchdeform.solvers.cg import to_csr
+
+
+def uneven_weights(grid: Grid) -> list[Tensor]:
+    """w_div, w_curl, w_zero, w_strain by element; divergence or curl is by far the dearer in most of them."""
+    div, curl, zero, strain = (element_values(grid) for _ in range(4))
+    return [div * 30 ** (2 * torch.rand_like(div) - 1), curl, zero, strain]
+
+
+def data_form(dim: int, weights: Weights) -> tuple[Form, list[int]]:
+    """The rows of divergence and curl, and which channel of (divergence, curl) each has."""
+    div, curl = div_form(dim, weights), curl_form(dim, weights)
+    turns = list(range(1, 1 + len(CURL_PAIRS[dim])))
+    return (*div, *curl), [*[0] * len(div), *turns, *turns]
 
 
 @pytest.mark.parametrize("weights", WEIGHTS)
@@ -33,32 +47,35 @@ def test_assembled_and_matrix_free_operators_equal_brute_force(brute, grid, weig
 
 @pytest.mark.parametrize("grid", GRIDS)
 def test_weights_by_element_equal_brute_force(brute, grid):
-    div, curl, zero = (element_values(grid) for _ in range(3))
+    weights = uneven_weights(grid)
     oracle = brute(grid.shape, grid.spacing)
-    matrix = oracle.matrix(oracle.div_curl(*(w[0, 0].numpy() for w in (div, curl, zero))), grid.dim)
-    form, v = div_curl_form(grid.dim, Weights(div, curl, zero)), random_field(grid)
-    close(assemble(form, grid).to_dense(), matrix)
-    close(apply_form(form, v, grid), (v.flatten(1) @ matrix).view_as(v))
+    matrix = oracle.matrix(oracle.div_curl(*(w[0, 0].numpy() for w in weights)), grid.dim)
+    form, v = div_curl_form(grid.dim, Weights(*weights)), random_field(grid)
+    assembled = assemble(form, grid)
+    close(assembled.to_dense(), matrix)
+    want = (v.flatten(1) @ matrix).view_as(v)
+    close(apply_form(form, v, grid), want)
+    close((to_csr(assembled) @ v.flatten(1).T).T.view_as(v), want)
     close(form_diagonal(form, grid, v).flatten(), matrix.diagonal())
 
 
-@pytest.mark.parametrize("weights", [(2.0, 0.5), (1.0, 1.0)])
+@pytest.mark.parametrize("weights", [(2.0, 0.5), (1.0, 1.0), (0.5, 2.0)])
 @pytest.mark.parametrize("grid", GRIDS)
 def test_right_hand_sides_equal_brute_force(brute, grid, weights):
-    form = div_curl_form(grid.dim, Weights(*weights))
-    data, oracle = random_field(grid, len(form)), brute(grid.shape, grid.spacing)
+    form, channels = data_form(grid.dim, Weights(*weights))
+    data, oracle = random_field(grid, 1 + max(channels)), brute(grid.shape, grid.spacing)
     want = torch.stack([oracle.load(oracle.div_curl(*weights), item, grid.dim) for item in data])
-    close(assemble_load(form, data, grid).flatten(1), want)
-    close(load_by_quadrature(form, data, grid).flatten(1), want)
+    close(assemble_load(form, data, grid, channels).flatten(1), want)
+    close(load_by_quadrature(form, data, grid, channels).flatten(1), want)
 
 
 @pytest.mark.parametrize("grid", GRIDS)
 def test_right_hand_sides_with_weights_by_element_equal_brute_force(brute, grid):
-    div, curl = element_values(grid), element_values(grid)
-    form, oracle = div_curl_form(grid.dim, Weights(div, curl)), brute(grid.shape, grid.spacing)
-    data = random_field(grid, len(form), batch=1)
+    div, curl, *_ = uneven_weights(grid)
+    (form, channels), oracle = data_form(grid.dim, Weights(div, curl)), brute(grid.shape, grid.spacing)
+    data = random_field(grid, 1 + max(channels), batch=1)
     want = oracle.load(oracle.div_curl(div[0, 0].numpy(), curl[0, 0].numpy()), data[0], grid.dim)
-    close(assemble_load(form, data, grid).flatten(), want)
+    close(assemble_load(form, data, grid, channels).flatten(), want)
 
 
 @pytest.mark.parametrize("per_point", [False, True])
@@ -94,7 +111,7 @@ def test_weights_that_vary_over_the_batch_spread_one_field():
 
 @pytest.mark.parametrize("grid", [Grid((3, 4), (0.5, 1.3)), Grid((2, 2, 2), (0.7, 1.0, 1.4))])
 def test_first_and_second_derivatives(grid):
-    form = div_curl_form(grid.dim, Weights(2.0, 0.5, 0.1))
+    form = div_curl_form(grid.dim, Weights(2.0, 0.5, 0.1, 0.7))
     v = random_field(grid, batch=1).requires_grad_()
     assert gradcheck(lambda t: apply_form(form, t, grid), v)
     assert gradgradcheck(lambda t: apply_form(form, t, grid).square().sum(), v, fast_mode=True)
@@ -106,8 +123,8 @@ def test_first_and_second_derivatives(grid):
         return apply_form(div_curl_form(grid.dim, Weights(*tensors)), field, grid)
 
     for weights in (
-        [element_values(grid)] * 3,
-        [torch.tensor([1.5], dtype=torch.float64).view(1, 1, *[1] * grid.dim)] * 3,
+        uneven_weights(grid),
+        [torch.tensor([1.5], dtype=torch.float64).view(1, 1, *[1] * grid.dim)] * 4,
     ):
         tensors = tuple(w.clone().requires_grad_() for w in weights)
         assert gradcheck(by_weight, (v, *tensors))

@@ -38,6 +38,21 @@ def test_all_solvers_have_one_answer(system, how):
     torch.testing.assert_close(factor(load, power=2), direct(load, power=2), rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.parametrize("how", ["transform", *HOW])
+def test_a_start_saves_steps_and_changes_no_answer(how):
+    """What a start says about given unknowns plays no part."""
+    system = SYSTEMS[0]
+    load = load_of(system)
+    factor = solver_of(how, system).init(system, load)
+    cold = factor.solution(load)
+    again = factor.solution(load, cold.value + system.fixed())
+    assert again.ok
+    assert not bool((again.steps > cold.steps.clamp(max=1)).any())
+    torch.testing.assert_close(again.value, cold.value, rtol=1e-9, atol=1e-9)
+    near = factor.solution(load, load_of(system).flip(1) + system.fixed())
+    torch.testing.assert_close(near.value, cold.value, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("method", ["cg", "assembled"])
 @pytest.mark.parametrize("system", SYSTEMS, ids=["2D", "3D"])

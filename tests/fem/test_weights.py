@@ -28,12 +28,13 @@ def test_what_is_constant_and_what_is_isotropic():
     assert not Weights().zero_positive
 
 
-def test_the_mean_is_taken_over_elements_only():
+def test_what_is_typical_is_a_quarter_up_the_elements_of_each_item():
     weight = torch.rand(3, 1, 3, 4) + 1
-    mean = Weights(weight, 2.0, torch.tensor(0.5)).mean()
-    torch.testing.assert_close(mean.div, weight.mean(dim=(1, 2, 3), keepdim=True))
-    assert mean.curl == 2.0
-    assert mean.constant
+    typical = Weights(weight, 2.0, torch.tensor(0.5), strain=10 * weight).typical()
+    torch.testing.assert_close(typical.div, weight.flatten(1).sort().values[:, 3].view(3, 1, 1, 1))
+    torch.testing.assert_close(typical.strain, 10 * typical.div)
+    assert typical.curl == 2.0
+    assert typical.constant
 
 
 def test_tensors_can_be_exchanged_and_moved():

@@ -14,7 +14,16 @@ DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 GRIDS = [Grid((4, 6), (0.5, 1.3)), Grid((2, 3), (1.0, 0.2)), Grid((3, 4, 3), (0.7, 1.0, 1.4)), Grid((2, 2, 2))]
 
 
-WEIGHTS = [(1.0, 1.0, 0.0), (2.0, 2.0, 0.3), (3.0, 0.5, 0.0), (0.2, 4.0, 0.6)]
+# w_div, w_curl, w_zero, w_strain: alike, apart so that some is looked at in the centres alone, and with strain.
+WEIGHTS = [
+    (1.0, 1.0, 0.0, 0.0),
+    (2.0, 2.0, 0.3, 0.0),
+    (3.0, 0.5, 0.0, 0.0),
+    (0.2, 4.0, 0.6, 0.0),
+    (1.0, 1.5, 0.1, 2.0),
+    (7.0, 0.0, 0.2, 5.0),
+    (0.3, 9.0, 0.0, 4.0),
+]
 
 
 close = partial(torch.testing.assert_close, atol=1e-13, rtol=1e-13)

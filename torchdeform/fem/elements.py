@@ -65,7 +65,8 @@ def components(form: Form) -> int:
 def row_table(row: Row, grid: Grid, count: int, device: torch.device) -> Tensor:
     """Return row(N_i) at the Gauss points of every element, ``(B, Q, count·2^D, *E)`` float64, unknown k·2^D + corner.
 
-    Q is 2^D, or 1 for a row at the centre. B and E_a are 1 where no coefficient varies; ``count`` is the number of components of the form.
+    Q is 2^D, or 1 for a row at the centre. B and E_a are 1 where no coefficient varies; ``count`` is the number of
+    components of the form.
     """
     ones = [1] * grid.dim
     points = 1 if row.centre else 2**grid.dim

@@ -13,8 +13,8 @@ across slip faces, −s/μ across tangential ones, it is
 
     B = diag(d) + δ t tᵀ,   d_k = w_curl (Σ_{a≠k} λ_a + t_k²) + w_div r_k + w_zero,   r = λ − t² = ((1 − cos θ)/μ)² / 3.
 
-What is integrated at the centres (see `form.div_form`) with weights e_div and e_curl has μ̄ = h (1 + cos θ)/2 in place of
-μ, for which κ μ̄ = s². So it is
+What is integrated at the centres (see `form.div_form`), with weights e_div and e_curl, has μ̄ = h (1 + cos θ)/2 in the
+place of μ, for which κ μ̄ = s². So it is
 
     e_div g gᵀ + e_curl (|g|² − g gᵀ),   g_k² = λ_k Π_{a≠k} μ̄_a/μ_a,   with the signs of t.
 
@@ -47,7 +47,7 @@ class FastTransform:
 
     Args:
         approximate: where the transforms do not invert K, invert a symmetric positive definite operator near it, made
-            of the mean weights: a preconditioner. Otherwise such a system is refused.
+            of the typical weights: a preconditioner. Otherwise such a system is refused.
         rtol: converged when ‖load − K v‖ ≤ max(rtol ‖load‖, atol); `DEFAULT_RTOL` of the dtype when None.
         atol: absolute tolerance on the residual.
     """
@@ -71,7 +71,7 @@ class TransformFactor(Factor):
     """Solve K v = load, K the Q1 matrix of ∫ w_div (div v)² + w_curl |curl v|² + w_zero |v|², by fast transforms.
 
     Args:
-        system: grid, weights (their means where they vary over space) and boundary.
+        system: grid, weights (what is typical of them where they vary over space) and boundary.
         like: a tensor with the type and device of the loads to come.
         rtol: relative tolerance that a solution is judged by.
         atol: absolute tolerance.
@@ -118,7 +118,7 @@ class TransformFactor(Factor):
         v = separable_transform(self._modes.divide(modes, power), self.kinds)
         return self.system.free(v) if masked else v
 
-    def solution(self, load: Tensor) -> Solution:
+    def solution(self, load: Tensor, start: Tensor | None = None) -> Solution:
         """Return v, with the residual that rounding leaves."""
         free = self.system.free(load)
         scale = magnitude(free)

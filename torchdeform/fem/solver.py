@@ -24,8 +24,8 @@ class SolverSettings:
             conjugate gradients without a stored matrix), ``assembled`` (the same with the matrix, assembled as torch
             sparse COO; beyond 1.8 million nodes in 2D and 270,000 in 3D without it), or ``auto``: ``transform`` where
             it is exact, else ``cg``. All have the same answer.
-        preconditioner: of conjugate gradients: ``transform`` (the direct solver with mean weights; where it is exact
-            one step is enough), ``jacobi`` (the diagonal), ``none``.
+        preconditioner: of conjugate gradients: ``transform`` (the direct solver with the weights that are
+            typical; where it is exact one step is enough), ``jacobi`` (the diagonal), ``none``.
         rtol: solved when ‖load − K v‖ ≤ max(rtol ‖load‖, atol). None asks for 1e-5 in float32 and 1e-10 in float64.
         atol: absolute tolerance on the residual.
         max_steps: steps of conjugate gradients at most.

@@ -17,11 +17,13 @@ from torchdeform.fem.weights import Weights
 
 @dataclass(frozen=True)
 class DivCurlSystem:
-    """K v = load: least squares of ∫ w_div (div v − α)² + w_curl |curl v − β|² + w_s |dev sym ∇v|² + w_zero |v|² − 2 f·v.
+    """K v = load: the weighted least squares of div v = α, curl v = β and dev sym ∇v = 0 under a force f.
+
+    v has the least ∫ w_div (div v − α)² + w_curl |curl v − β|² + w_strain |dev sym ∇v|² + w_zero |v|² − 2 f·v.
 
     Args:
         grid: the grid of v.
-        weights: w_div, w_curl, w_zero, w_s.
+        weights: w_div, w_curl, w_zero, w_strain.
         boundary: which components are given at which faces, see `resolve_boundary`; K acts on the others.
         also_fixed: mask ``(B or 1, D, *S)`` of unknowns that are given besides, None for none.
 

@@ -144,12 +144,12 @@ class Weights:
 
 
 def _parts(weight: Weight, other: Weight) -> tuple[Weight, Weight]:
-    if isinstance(weight, Tensor) or isinstance(other, Tensor):
-        like = weight if isinstance(weight, Tensor) else other
+    like = next((w for w in (weight, other) if isinstance(w, Tensor)), None)
+    if like is not None:
         first, second = (torch.as_tensor(w, dtype=like.dtype, device=like.device) for w in (weight, other))
         exact = torch.minimum(first, _MOST_DEAR * second)
     else:
-        exact = min(weight, _MOST_DEAR * other)
+        exact = min(float(weight), _MOST_DEAR * float(other))
     return exact, weight - exact
 
 

@@ -118,11 +118,12 @@ class Factor(ABC):
     system: Any
 
     @abstractmethod
-    def solution(self, load: Tensor) -> Solution:
+    def solution(self, load: Tensor, start: Tensor | None = None) -> Solution:
         """Return v with K v = load, and how the solve went.
 
         Args:
             load: right-hand side ``(B, C, *S)``; what it says about given unknowns is left out.
+            start: a v that is near ``(B, C, *S)``, for solvers that go on from one; direct ones have no use for it.
         """
 
     @abstractmethod

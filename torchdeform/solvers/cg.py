@@ -148,12 +148,13 @@ class ConjugateGradientFactor(Factor):
     ) -> None:
         self.solver, self.system, self.product, self.precondition = solver, system, product, precondition
 
-    def solution(self, load: Tensor) -> Solution:
-        """Return v with K v = load; see `conjugate_gradient`."""
+    def solution(self, load: Tensor, start: Tensor | None = None) -> Solution:
+        """Return v with K v = load, from ``start`` (zero when None) on; see `conjugate_gradient`."""
         return conjugate_gradient(
             Operator(self.product, self.system.parameters),
             self.system.free(load),
             preconditioner=self.precondition,
+            x0=None if start is None else self.system.free(start),
             rtol=self.solver.rtol,
             atol=self.solver.atol,
             max_steps=self.solver.max_steps,
