@@ -11,6 +11,7 @@ the run with tissue must reach.
 
 import argparse
 import os
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
@@ -23,8 +24,11 @@ import numpy as np
 import torch
 from machine import describe_machine
 from peer_tools import ELASTIX_RIGID, TOOLS, Job, load
-from tissue_phantoms import Phantom, blocks, bones, lesion
 from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from tissue_phantoms import Phantom, blocks, bones, lesion
 
 import torchdeform as td
 from torchdeform.deformation.volumes import nodal_volumes

@@ -66,6 +66,7 @@ def _calls(grid: td.Grid) -> dict[str, Callable[[], Tensor]]:
     rigid[..., :3] = True
     u = 0.3 * torch.sin(grid.points() / 4)
     marks = replace(QUICK, points_weight=0.1)
+    weights = td.Weights(curl=0.0, zero=0.1, strain=labels[(..., *[slice(1, None)] * grid.dim)] + 0.5)
     generator = torch.Generator("cpu").manual_seed(1)
     return {
         "register": lambda: td.register(fixed, moving, QUICK).displacement,
@@ -90,6 +91,7 @@ def _calls(grid: td.Grid) -> dict[str, Callable[[], Tensor]]:
             layers.SimilarityLoss(name)(fixed, moving) for name in ("ssd", "ncc", "lncc", "mi", "nmi", "ngf", "mind")
         ]),
         "layer": lambda: layers.DeformableRegistration(grid, steps=2)(fixed, moving),
+        "weights": lambda: layers.DivCurlVelocity(grid, weights=weights)(fixed),
         "augmentation": lambda: layers.RandomDeformation(grid)(fixed, generator=generator),
     }  # fmt: skip
 

@@ -205,6 +205,7 @@ class State:
         values: similarity of each map after each step ``(B,)``.
         best_values: what was maximised at its best so far, after each step.
         shortened: steps that were shortened because they would have folded, summed over the batch.
+        ascent: of the last step, as the solver left it, where tissue varies.
     """
 
     u: Tensor
@@ -215,6 +216,7 @@ class State:
     values: tuple[Tensor, ...] = ()
     best_values: tuple[Tensor, ...] = ()
     shortened: int = 0
+    ascent: Tensor | None = None
 
 
 def forward_objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
@@ -357,7 +359,8 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     barrier = fold_barrier(state.lowest, settings.folds.soft_determinant)
     force, load = held_still(force, level.held), None if load is None else held_still(load, level.held)
     coupling = objective.coupling
-    v = held_still(level.metric.ascent(force, barrier, load, coupling.together), level.held)
+    ascent = level.metric.ascent(force, barrier, load, coupling.together, state.ascent)
+    v = held_still(ascent, level.held)
     v = normalise_step(coupling.velocity(v), grid, coupling.together)
     direction = v + settings.optimiser.momentum * state.direction
     v = normalise_step(direction, grid, coupling.together)
@@ -368,7 +371,8 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     moved, u, lowest = fold_free_step(level, state, v * per_item(size * state.active, v))
     shortened = state.shortened + int((moved < 1).sum())
     active = state.active & (moved > 0)
-    return replace(state, u=u, lowest=lowest, direction=direction, active=active, shortened=shortened), False
+    state = replace(state, u=u, lowest=lowest, direction=direction, active=active, shortened=shortened)
+    return replace(state, ascent=None if level.tissue is None else ascent), False
 
 
 def held_still(field: Tensor, axes: Sequence[int]) -> Tensor:

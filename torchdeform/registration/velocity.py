@@ -76,9 +76,15 @@ class VelocityMetric:
         """The grid of velocities."""
         return self.system.grid
 
-    def velocity(self, force: Tensor, div: Tensor | None = None) -> Tensor:
-        """Return v with K v = load of a force density ``(B, D, *S)`` and of a divergence ``(B, 1, *S)``."""
-        return self.factor(self.system.load(div=div, force=force), power=self.order)
+    def velocity(self, force: Tensor, div: Tensor | None = None, near: Tensor | None = None) -> Tensor:
+        """Return v with K v = load of a force density ``(B, D, *S)`` and of a divergence ``(B, 1, *S)``.
+
+        Where tissue varies it is found from a velocity that is ``near``, to a share of the load.
+        """
+        load = self.system.load(div=div, force=force)
+        if near is None or self.order > 1:
+            return self.factor(load, power=self.order)
+        return self.factor.solution(load, near).value
 
     def ascent(
         self,
@@ -86,6 +92,7 @@ class VelocityMetric:
         barrier: Tensor | None = None,
         points: Tensor | None = None,
         together: Callable[[Tensor], Tensor] = _alone,
+        near: Tensor | None = None,
     ) -> Tensor:
         """Return the velocity of steepest ascent, of any length.
 
@@ -93,6 +100,7 @@ class VelocityMetric:
             force: force density of the images ``(B, D, *S)``, in any unit; it is scaled to 1 at its strongest.
             barrier: divergence asked for ``(B, 1, *S)`` where the map is nearly folded, see `fold_barrier`.
             points: load of the landmarks ``(B, D, *S)``, in the unit of the force.
+            near: a velocity to begin with, see `velocity`.
             together: of sizes ``(B,)``, the largest of those that are scaled together.
 
         Notes:
@@ -103,7 +111,7 @@ class VelocityMetric:
         scale = 1 / together(strongest).clamp(min=torch.finfo(force.dtype).tiny)
         weights = self.system.weights
         div = None if barrier is None else barrier * (_BARRIER_WEIGHT / weights.div)
-        v = self.velocity(force * per_item(scale, force), div)
+        v = self.velocity(force * per_item(scale, force), div, near)
         if points is not None:
             load = points * per_item(scale * (self.grid.cell_volume * weights.zero), points)
             v = v + self.factor(load, power=self.order + 1)
