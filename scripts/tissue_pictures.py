@@ -4,12 +4,14 @@ import math
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 import torchdeform as td
 from torchdeform.core.warp import sample
 from torchdeform.report.contours import outlines
 from torchdeform.report.drawing import (
     CURVES,
+    Floats,
     draw_bar,
     draw_faint,
     draw_image,
@@ -43,10 +45,7 @@ def compare(folder: Path) -> Path:
         draw_lines(row[1], plane, u[0], _LINES)
         volume = td.jacobian_determinant(u, grid)[0].clamp(min=1e-3).log()
         shown = draw_map(row[2], plane, volume, scale)
-        moved = [
-            line + sample(u, torch.from_numpy(line.T[::-1].copy())[None].float(), grid)[0].flip(0).T.numpy()
-            for line in border
-        ]
+        moved = [_moved(line, u, grid) for line in border]
         shapes = (border if image == "fixed" else [], moved, border)
         for panel, lines in zip(row, shapes, strict=True):
             draw_lines_over(panel, lines, CURVES[2])
@@ -56,3 +55,9 @@ def compare(folder: Path) -> Path:
             draw_bar(sheet.below(row[2], 0.7 * _WIDTH, 0.1, 0.12), shown, scale)
     save_png(sheet.figure, folder / "compared.png")
     return folder / "compared.png"
+
+
+def _moved(line: Floats, u: Tensor, grid: td.Grid) -> Floats:
+    """Return where φ takes the points (across, down) of a line on a grid of spacing 1."""
+    places = torch.from_numpy(line.T[::-1].copy())[None].float()
+    return (places + sample(u, places, grid))[0].flip(0).T.numpy()

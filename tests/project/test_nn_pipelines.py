@@ -134,8 +134,9 @@ def test_every_layer_says_what_it_is():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 @pytest.mark.parametrize("grid", GRIDS, ids=["2D", "3D"])
-def test_moves_to_a_gpu(grid):
-    model = Pipeline(grid)
+@pytest.mark.parametrize("kind", [Pipeline, PredictedWeights])
+def test_moves_to_a_gpu(kind, grid):
+    model = kind(grid)
     here = model(pairs(grid, 2))
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # or the network's convolutions have 10 bits
         there = copy.deepcopy(model).cuda()(pairs(grid, 2).cuda())

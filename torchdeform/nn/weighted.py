@@ -63,8 +63,8 @@ def weighted_velocity(data: Tensor, system: DivCurlSystem, solver: str) -> Tenso
         ComputationError: the tolerance was not met.
 
     Notes:
-        Differentiable in the data and in θ to every degree: for a cotangent g of v let λ = K⁻¹ g; what A(θ) data − K(θ) v
-        leaves of λ is the cotangent of the data and of θ.
+        Differentiable in the data and in θ to every degree. A cotangent g of v is λ = K⁻¹ g for the load; that of data
+        and θ is the derivative of λᵀ (A(θ) data − K(θ) v) at constant v.
     """
     weights = system.weights
     numbers = [0.0 if isinstance(w, Tensor) else float(w) for w in weights.values]
