@@ -12,7 +12,7 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.regions import Crop, grown, nearest, require_labels
 
 # Voxels over which a correction fades out: the first that leave the determinants that are asked for.
-_WIDTHS = (2, 4, 8, 16)
+_WIDTHS = (4, 8, 16)
 
 # No correction takes a node nearer to a face of the box than to this share of its distance before.
 _SQUEEZE = 0.2
@@ -113,8 +113,8 @@ class RigidHold:
 
     Notes:
         On a label and on the nodes next to it, over corners too, u becomes the rigid motion that fits φ best on the
-        label. The correction at the nearest of these nodes, less and less of it, is made around them: over 2 voxels, or
-        4, 8 or 16 where fewer would fold. What is rigid already is left as it is, and so is all around it. Between
+        label. The correction at the nearest of these nodes, less and less of it, is made around them: over 4 voxels, or
+        8 or 16 where fewer would fold. What is rigid already is left as it is, and so is all around it. Between
         labels both corrections are made, more of the nearer one's; no label reaches the nodes of another.
         On a face of the box that a label does not touch the components that lead out stay as they are, and near it less
         of the correction is made to them. Where a label touches a face it takes the nodes of the face along, into the
