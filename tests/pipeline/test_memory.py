@@ -63,7 +63,11 @@ def test_each_label_that_glides_takes_the_part_of_a_map():
     grid = Grid((96, 96, 96))
     free, one, three = (need(grid, similarity="lncc", sliding=labels) for labels in ((), (1,), (1, 2, 3)))
     assert three - free == pytest.approx(3 * (one - free), abs=4)
-    assert (free, one, three) == (pytest.approx(610e6, rel=0.1), pytest.approx(654e6, rel=0.1), pytest.approx(802e6, rel=0.1))
+    assert (free, one, three) == (
+        pytest.approx(610e6, rel=0.1),
+        pytest.approx(654e6, rel=0.1),
+        pytest.approx(802e6, rel=0.1),
+    )
     assert one == need(grid, similarity="lncc", sliding=(1, 1))
 
 
