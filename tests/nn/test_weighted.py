@@ -100,6 +100,20 @@ def test_ways_to_say_the_same(grid):
         torch.testing.assert_close(v, wanted, rtol=0, atol=1e-8)
 
 
+def test_a_layer_made_of_predicted_weights_hands_gradients_on():
+    """Made anew for each prediction, as within a loss; under `torch.func` too."""
+    grid, (div, curl) = GRIDS[0], some_data(GRIDS[0])
+    raw = torch.randn(2, 1, 4, 3, dtype=torch.float64)
+
+    def energy(raw: Tensor) -> Tensor:
+        return DivCurlVelocity(grid, weights=Weights(strain=raw.exp()))(div, curl).square().sum()
+
+    assert torch.autograd.gradcheck(energy, raw.clone().requires_grad_(), fast_mode=True)
+    (wanted,) = torch.autograd.grad(energy(leaf := raw.clone().requires_grad_()), leaf)
+    torch.testing.assert_close(torch.func.grad(energy)(raw), wanted)
+    torch.testing.assert_close(torch.func.vmap(torch.func.grad(energy))(raw[None])[0], wanted)
+
+
 def test_where_strain_is_dear_the_velocity_keeps_shapes():
     """Of a source beside it, a block in which divergence and strain are dear turns and moves, but is not bent."""
     grid = Grid((25, 25))

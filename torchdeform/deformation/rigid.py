@@ -29,6 +29,12 @@ def hold_rigid(u: Tensor, inside: Tensor, grid: Grid, floor: float = 0.3) -> Ten
         inside: labels ``(B or 1, L, *S)`` of bool.
         grid: the grid.
         floor: smallest one-sided determinant wanted around the labels.
+
+    Returns:
+        ``(B, D, *S)``; where nothing folds less, folded: look at `diagnose`.
+
+    Raises:
+        InputError: shapes or types.
     """
     return RigidHold(inside, grid)(u, floor)
 

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torchdeform.core.derivatives import CURL_PAIRS
 from torchdeform.core.flow import OdeSolver, integrate
 from torchdeform.core.grid import Grid
+from torchdeform.core.tables import in_transformation
 from torchdeform.errors import InputError, require_choice
 from torchdeform.fem.fast_transform import is_exact_for
 from torchdeform.fem.solver import SolverSettings
@@ -67,7 +68,8 @@ class DivCurlVelocity(nn.Module):
             raise InputError("DivCurlVelocity: weights are given twice; give weights, or weight_div and its like")
         chosen = short if weights is None else weights
         _require_weights(chosen, grid)
-        chosen.check(grid)
+        if not in_transformation():  # which may hide the values until they are used
+            chosen.check(grid)
         system = DivCurlSystem(grid, chosen, boundary)
         if SolverSettings(method=solver).method == "transform" and not is_exact_for(system):
             raise InputError(

@@ -59,6 +59,10 @@ class Coupling:
         """Return for each map whether all that move together are flagged, ``(B,)``."""
         return flags
 
+    def extended(self, u: Tensor) -> Tensor:
+        """Return the displacements ``(B, D, *S)`` after what a step leaves to be done where they do not count."""
+        return u
+
     def together(self, sizes: Tensor) -> Tensor:
         """Return for each map the largest size ``(B,)`` of those that are scaled together."""
         return sizes
@@ -402,6 +406,7 @@ def fold_free_step(level: Level, state: State, v: Tensor) -> tuple[Tensor, Tenso
         if settings.metric.elasticity > 0:
             moved = per_item(settings.metric.elasticity * share * state.active, u)
             u = smooth_elastically(u, moved if free is None else moved * free, grid)
+        u = level.objective.coupling.extended(u)
         if level.hold is not None:
             u = level.hold(u, floor)
         lowest = one_sided_determinant(u, grid)

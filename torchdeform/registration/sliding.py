@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchdeform.core.derivatives import derivative
-from torchdeform.core.fold_free import lowest_determinant, neighbour_mean, repair_folds
+from torchdeform.core.fold_free import keep_faces, lowest_determinant, neighbour_mean, repair_folds
 from torchdeform.core.grid import Grid
 from torchdeform.metrics.base import Similarity, weighted
 from torchdeform.registration.optimise import Coupling, Objective, forward_objective, optimise_levels
@@ -21,6 +21,9 @@ from torchdeform.registration.settings import RegistrationSettings
 
 # How often a border is smoothed to see its direction: some 2 voxels wide.
 _ROUNDS = 4
+
+# How often the values of a side are smoothed to go on beyond it: 2 voxels.
+_BEYOND = 2
 
 # Widths in voxels over which one map passes into the other where a narrower border folds, each so much wider.
 _NARROWEST, _WIDER, _WIDEST, _TRIALS = 1.0, 1.5, 8.0, 30
@@ -108,8 +111,10 @@ class Gliding(Coupling):
     """
 
     def __init__(self, sides: Tensor, grid: Grid) -> None:
-        self.count = sides.shape[1]
-        self.shares = smoothed((sides > 0.5).to(sides))
+        self.grid, self.count = grid, sides.shape[1]
+        own = (sides > 0.5).to(sides)
+        self.own, self.reach = own.unsqueeze(2), smoothed(own, _BEYOND).unsqueeze(2)
+        self.shares = smoothed(own)
         slopes = torch.stack([derivative(self.shares, grid, a) for a in range(grid.dim)], dim=2)  # (B, K, D, *S)
         length = slopes.square().sum(2, keepdim=True).sqrt()
         self.normals = slopes / length.clamp(min=torch.finfo(sides.dtype).tiny)
@@ -121,6 +126,17 @@ class Gliding(Coupling):
         mean = (apart * self.shares.unsqueeze(2)).sum(1, keepdim=True)
         across = ((mean - apart) * self.normals).sum(2, keepdim=True)
         return (apart + self.near * across * self.normals).transpose(0, 1).flatten(0, 1)
+
+    def extended(self, u: Tensor) -> Tensor:
+        """Return the displacements ``(K·B, D, *S)``, each going on beyond its side as it is there.
+
+        What holds a map back beyond its side would else hold back its border.
+        """
+        apart = u.unflatten(0, (self.count, -1)).transpose(0, 1)  # (B, K, D, *S)
+        flat = (apart * self.own).flatten(1, 2)
+        near = smoothed(flat, _BEYOND).unflatten(1, (self.count, -1)) / self.reach.clamp(min=1e-6)
+        beyond = (1 - self.own) * (10 * self.reach).clamp(max=1)
+        return keep_faces(torch.lerp(apart, near, beyond.expand_as(apart)).transpose(0, 1).flatten(0, 1), u, self.grid)
 
     def all(self, flags: Tensor) -> Tensor:
         return flags.unflatten(0, (self.count, -1)).all(0).repeat(self.count)

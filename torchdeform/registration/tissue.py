@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import restrict
+from torchdeform.deformation.incompressible import hold_volume
 from torchdeform.deformation.rigid import RigidHold
 from torchdeform.deformation.tissue import label_fit
 from torchdeform.errors import InputError
@@ -109,6 +110,7 @@ class Tissue:
         found = [(self._fits(u, grid))]
         if (hold := self.hold(grid)) is not None:
             u = hold(u, floor)
+        u = hold_volume(u, self.masks("incompressible"), grid, still=self.masks("rigid"))
         found.append(self._fits(u, grid))
         nodes = (self.shares > 0.5).flatten(2).sum(2).expand(len(u), -1)
         named = zip(self.labels, self.kinds, self.sliding, nodes.unbind(1), *found, strict=True)
