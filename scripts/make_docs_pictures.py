@@ -30,9 +30,12 @@ SOURCES = {
     "how-to/contrasts": "contrasts/results/overview.png",
     "how-to/grids": "results/grid/grid.png",
     "how-to/volume-change": "contrasts/atrophy/grid.png",
+    "how-to/tissue": "breathing/with/overview.png",
 }
 # What else is shown of a page's results.
 MORE = {"start": {"overview": "results/overview.png"}}
+# Pairs that a page registers without and with what is known of their tissue.
+COMPARED = {"how-to/tissue": ("bones", "breast", "breathing")}
 
 
 def commands(page: str) -> list[list[str]]:
@@ -90,12 +93,16 @@ def small(path: Path) -> bytes:
 
 def pictures(pages: list[str]) -> Iterator[tuple[str, bytes]]:
     """Yield the names of the pictures of some pages, and their JPEGs."""
+    from tissue_pictures import compare
+
     for page in pages:
         with tempfile.TemporaryDirectory() as folder:
             name = "report" if page == "start" else Path(page).name
             yield name, small(picture(page, Path(folder)))
             for other, path in MORE.get(page, {}).items():
                 yield other, small(Path(folder) / path)
+            for pair in COMPARED.get(page, ()):
+                yield pair, small(compare(Path(folder) / pair))
 
 
 if __name__ == "__main__":

@@ -100,6 +100,31 @@ def contrasts(out: Path) -> None:
         _write(out / f"{name}.nii.gz", (values + 3 * _noise(grid.shape, 0.7, 7)).clamp(min=0), grid)
 
 
+def bones(out: Path) -> None:
+    """A femur and a tibia that turn against each other, with labels: 1 femur, 2 tibia."""
+    _write_tissue(out, "bones")
+
+
+def breast(out: Path) -> None:
+    """A breast whose lesion fills with contrast and moves, with the lesion as label 1."""
+    _write_tissue(out, "lesion")
+
+
+def breathing(out: Path) -> None:
+    """A frontal slice of a chest, breathed out and in, with what glides along the ribs as label 1."""
+    _write_tissue(out, "breathing")
+
+
+def _write_tissue(out: Path, kind: str) -> None:
+    """Write a phantom of the benchmark of tissue."""
+    import tissue_phantoms
+
+    phantom = getattr(tissue_phantoms, kind)()
+    for name, values in (("fixed", phantom.fixed), ("moving", phantom.moving)):
+        _write(out / f"{name}.nii.gz", values, phantom.grid)
+    _write(out / "tissue.nii.gz", phantom.tissue, phantom.grid, kind="int16")
+
+
 def _brain_labels(grid: td.Grid) -> Tensor:
     """Return 0 outside, 1 ventricles, 2 white matter, 3 cortex, 4 skull."""
     unit = 2 * grid.points() / grid.along(grid.extent, grid.points()) - 1
@@ -150,7 +175,16 @@ def _write(path: Path, values: Tensor, grid: td.Grid, *, kind: str = "float32", 
     td.write_image(td.Image(values.float(), grid, origin, pixel_type=kind), path)
 
 
-KINDS = {"brains": brains, "lungs": lungs, "hearts": hearts, "histology": histology, "contrasts": contrasts}
+KINDS = {
+    "brains": brains,
+    "lungs": lungs,
+    "hearts": hearts,
+    "histology": histology,
+    "contrasts": contrasts,
+    "bones": bones,
+    "breast": breast,
+    "breathing": breathing,
+}
 
 
 def main(names: list[str]) -> None:

@@ -7,6 +7,7 @@ from .core.image import Image
 from .core.transform import Affine, Displacement, Transform
 from .core.warp import compose, invert, warp
 from .deformation.averages import average_maps
+from .deformation.incompressible import hold_volume
 from .deformation.monitors import (
     MonitorSettings,
     ball_monitor,
@@ -21,6 +22,8 @@ from .deformation.monitors import (
 )
 from .deformation.prescribed import NewtonSettings, from_jacobian_and_curl
 from .deformation.reconstruction import reconstruct
+from .deformation.rigid import hold_rigid
+from .deformation.tissue import label_fit
 from .deformation.velocity import find_velocity
 from .deformation.versions import (
     DeformationSettings,
@@ -56,6 +59,7 @@ from .registration.settings import (
     RegistrationSettings,
 )
 from .registration.template import AveragingSettings, Template, build_template
+from .registration.tissue import TissueFit, TissueOutcome
 from .registration.verdict import Finding, Verdict
 from .solvers.base import Solution, Status
 
@@ -64,16 +68,16 @@ __version__: str
 # fmt: off
 __all__ = [
     "Affine", "Alignment", "AlignmentSettings", "Annotations", "AveragingSettings", "ComputationError",
-    "DeformationSettings", "Diagnosis", "DiscreteSettings", "Displacement", "Evaluation", "Evidence", "Finding", "Grid",
-    "Image", "InputError", "Measures", "MonitorSettings", "NewtonSettings", "OdeSolver", "RegistrationResult",
-    "RegistrationSettings", "Solution", "SolverSettings", "Status", "Template", "TorchdeformError", "Transform",
-    "Verdict", "Weights", "align",
-    "average_maps", "ball_monitor", "box_monitor", "build_template", "compose", "curl", "curvature_monitor",
-    "density_monitor", "diagnose", "dice", "discrete_start", "divergence", "find_velocity", "from_jacobian_and_curl",
-    "gradient_monitor", "grid_from_initial_monitor", "grid_from_target_monitor", "hausdorff", "integrate", "invert",
-    "jacobian_determinant", "label_monitor", "line_monitor", "load_settings", "monitor_misfit", "normalise_monitor",
-    "read_image", "read_labels", "read_points", "read_transform", "reconstruct", "register", "ring_monitor",
-    "simulate_volume_change", "solve_div_curl", "track_moving_monitor", "warp", "write_image", "write_labels",
-    "write_points", "write_transform",
+    "DeformationSettings", "Diagnosis", "DiscreteSettings", "Displacement", "Evaluation", "Evidence", "Finding",
+    "Grid", "Image", "InputError", "Measures", "MonitorSettings", "NewtonSettings", "OdeSolver",
+    "RegistrationResult", "RegistrationSettings", "Solution", "SolverSettings", "Status", "Template", "TissueFit",
+    "TissueOutcome", "TorchdeformError", "Transform", "Verdict", "Weights", "align", "average_maps", "ball_monitor",
+    "box_monitor", "build_template", "compose", "curl", "curvature_monitor", "density_monitor", "diagnose", "dice",
+    "discrete_start", "divergence", "find_velocity", "from_jacobian_and_curl", "gradient_monitor",
+    "grid_from_initial_monitor", "grid_from_target_monitor", "hausdorff", "hold_rigid", "hold_volume", "integrate",
+    "invert", "jacobian_determinant", "label_fit", "label_monitor", "line_monitor", "load_settings",
+    "monitor_misfit", "normalise_monitor", "read_image", "read_labels", "read_points", "read_transform",
+    "reconstruct", "register", "ring_monitor", "simulate_volume_change", "solve_div_curl", "track_moving_monitor",
+    "warp", "write_image", "write_labels", "write_points", "write_transform",
 ]
 # fmt: on

@@ -36,6 +36,12 @@ CASES = (
     *((3, n, 1, "similarity=lncc", "symmetric=true") for n in (64, 96, 128, 160)),
     *((3, 96, 1, f"similarity={s}", "symmetric=true") for s in ("ssd", "mi", "ngf", "mind")),
     (3, 96, 3, "similarity=lncc", "symmetric=true"),
+    *(
+        (d, n, 1, "similarity=lncc", f"sliding={labels}")
+        for d, n in ((2, 1024), (3, 96))
+        for labels in ([1], [1, 2, 3])
+    ),
+    *((d, n, 1, "similarity=lncc", "tissues.1=rigid") for d, n in ((2, 512), (3, 96))),
 )
 
 Case = tuple[Any, ...]
@@ -63,9 +69,22 @@ def run(case: Case) -> int:
         for name, shift in zip(names, (0, 1), strict=True):
             write_image(Image(data.roll(shift, 2), Grid((n,) * dim)), name)
         del data
+        if any(setting.startswith(("tissues", "sliding")) for setting in settings):
+            write_image(Image(_bars(dim, n), Grid((n,) * dim)), f"{folder}/tissue.nrrd")
+            choices.append(f"--tissue={folder}/tissue.nrrd")
         if register([*map(str, names), "--out", f"{folder}/out", *choices]):
             raise SystemExit(f"{case} could not be registered")
     return peak() or 0
+
+
+def _bars(dim: int, n: int) -> Any:
+    """Return labels 1 to 3 in bars."""
+    import torch
+
+    labels, part = torch.zeros(1, 1, *[n] * dim), n // 8
+    for k in range(3):
+        labels[(..., slice((2 * k + 1) * part, (2 * k + 2) * part), *[slice(2 * part, 6 * part)] * (dim - 1))] = k + 1
+    return labels
 
 
 def measure(case: Case) -> int:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _REACH = 0.5  # the images of coordinates reach this share of the moving image beyond its sides
+ELASTIX_RIGID = "rigid.nii"  # the file in a job's folder that says where elastix_rigid wants a rigid map
 _FAR = 1e6  # the coordinate of what lies beyond them
 
 
@@ -237,7 +238,8 @@ def _dimension(job: Job) -> int:
     return reader.GetDimension()
 
 
-def _elastix(job: Job) -> Mapped:
+def _elastix(job: Job, extra: Callable[[Job], dict[str, list[str]]] = lambda _: {}) -> Mapped:
+    """Register with the default parameter maps; ``extra`` are entries for that of the B-splines."""
     itk = import_module("itk")
     fixed, moving = (itk.imread(name, itk.F) for name in job.names)
     parameters = itk.ParameterObject.New()
@@ -246,6 +248,8 @@ def _elastix(job: Job) -> Mapped:
         choice["WriteResultImage"], choice["ErodeMask"] = ["false"], ["false"]
         choice["AutomaticTransformInitialization"] = ["true"]
         choice["AutomaticTransformInitializationMethod"] = ["CenterOfGravity"]
+        for key, values in (extra(job) if kind == "bspline" else {}).items():
+            choice[key] = values
         parameters.AddParameterMap(choice)
     method = itk.ElastixRegistrationMethod.New(fixed, moving)
     if job.masks:
@@ -262,6 +266,22 @@ def _elastix(job: Job) -> Mapped:
         return by_displacement(job, itk.array_from_image(field))
 
     return displacement
+
+
+def _rigidity(job: Job) -> dict[str, list[str]]:
+    """Return elastix' rigidity penalty, weighted as in its own example, on the voxels of a file."""
+    return {
+        "Registration": ["MultiMetricMultiResolutionRegistration"],
+        "Metric": ["AdvancedMattesMutualInformation", "TransformRigidityPenalty"],
+        "Metric0Weight": ["1.0"],
+        "Metric1Weight": ["4.0"],
+        "LinearityConditionWeight": ["10.0"],
+        "OrthonormalityConditionWeight": ["1.0"],
+        "PropernessConditionWeight": ["2.0"],
+        "UseFixedRigidityImage": ["true"],
+        "UseMovingRigidityImage": ["false"],
+        "FixedRigidityImageName": [str(job.folder / ELASTIX_RIGID)],
+    }
 
 
 def _dipy(job: Job) -> Mapped:
@@ -414,6 +434,7 @@ _ELASTIX = (
     "default parameter maps affine and bspline, four resolutions, 10 voxels between the last control points, "
     "started at the centres of gravity"
 )
+_RIGIDITY = "as elastix, with TransformRigidityPenalty of weight 4 on the voxels of rigid.nii"
 _CONVEX = "greedy's affine (image centres, NCC 2x2x2), then convex_adam_pt as it comes, float32; volumes only"
 _FIREANTS = "its quickstart: AffineRegistration and GreedyRegistration, CC of width 5, scales 4, 2, 1"
 _FIREANTS_MODULES = ("fireants.io", "fireants.registration.affine", "fireants.registration.greedy")
@@ -434,6 +455,7 @@ TOOLS: dict[str, Tool] = {
     "ants_syn": _ants("SyN"),
     "ants_syncc": _ants("SyNCC"),
     "elastix": Tool("itk-elastix", ("itk", "SimpleITK"), _ELASTIX, _elastix),
+    "elastix_rigid": Tool("itk-elastix", ("itk", "SimpleITK"), _RIGIDITY, lambda job: _elastix(job, _rigidity)),
     "dipy": Tool("dipy", (*_DIPY_MODULES, "SimpleITK"), _DIPY, _dipy),
     "convexadam": Tool("convexAdam", ("convexAdam.convex_adam_MIND", "picsl_greedy"), _CONVEX, _convex_adam),
     "fireants": Tool("fireants", (*_FIREANTS_MODULES, "SimpleITK"), _FIREANTS, _fireants),

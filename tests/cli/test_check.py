@@ -74,6 +74,7 @@ def test_the_verb_warns_and_draws(run, tmp_path):
         (["fixed.nii.gz", "far.nrrd", "--align", "none"], 2, "error: fixed.nii.gz and far.nrrd do not overlap"),
         (["fixed.nii.gz", "plane.nii.gz", "--out", "a.png"], 2, "error: fixed.nii.gz is 3D but plane.nii.gz is 2D"),
         (["fixed.nii.gz", "fixed.nii.gz", "--moving-mask", "nothing.nii.gz"], 2, "error: nothing.nii.gz is empty"),
+        (["fixed.nii.gz", "far.nrrd", "--tissue", "nothing.nii.gz"], 2, "error: nothing.nii.gz has no label above 0"),
         (["fixed.nii.gz", "nothing.nii.gz"], 2, "error: nothing.nii.gz is constant"),
         (["fixed.nii.gz", "absent.nii.gz"], 2, "absent.nii.gz does not exist"),
         (["fixed.nii.gz", "far.nrrd", "--fixed-mask", "absent.nii.gz"], 2, "absent.nii.gz does not exist"),

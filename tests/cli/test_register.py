@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -19,6 +20,7 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, resample
 from torchdeform.errors import ComputationError
 from torchdeform.io import read_displacement, read_image, write_image
+from torchdeform.registration.tissue import TissueFit, TissueOutcome
 
 RESULTS = ["displacement.nii.gz", "inverse.h5", "overview.png", "report.html", "result.json", "transform.h5"]
 
@@ -261,9 +263,68 @@ def _channels():
     _write("bad.mha", torch.rand(1, 5, 9, 9))
 
 
+def _tissue(*labels):
+    def write():
+        values = torch.zeros(1, 1, 24, 30)
+        for k, label in enumerate(labels):
+            values[..., 6 * k : 6 * k + 5, 2:9] = label
+        _write("tissue.png", values, pixel_type="uint8")
+
+    return write
+
+
+PAIR = ["fixed.png", "moving.png"]
+WITH_TISSUE = [*PAIR, "--tissue", "tissue.png"]
+
+
+def test_tissue_goes_to_the_engine_and_into_summary_and_command(folder, engine, make_result, capsys):
+    seen, nodes = [], torch.tensor([35])
+    kept = TissueFit(*torch.tensor([[0.0213], [0.0081], [1.0002]])), TissueFit(*torch.tensor([[0.3], [0.04], [0.98]]))
+    known = (
+        TissueOutcome(1, "rigid", False, nodes, kept[1], kept[0]),
+        TissueOutcome(3, "incompressible", True, nodes, kept[1], kept[0]),
+        TissueOutcome(5, "stiff", False, nodes, *[kept[0]] * 2),
+        TissueOutcome(7, "free", True, nodes, *[kept[0]] * 2),
+    )
+
+    def register(*images, annotations, **more):
+        seen.append(annotations.tissue.data.unique().tolist())
+        return replace(make_result(*images, annotations=annotations, **more), tissue=known)
+
+    engine.register = register
+    _tissue(1, 3)()
+    how = ["--set", "tissues.1=rigid", "--set", "tissues.3={div: 50, strain: 5}", "--set", "sliding=3", "--out", "out"]
+    assert main([*WITH_TISSUE, *how]) == 0
+    out = capsys.readouterr().out
+    for line in (
+        "tissue 1 (rigid)                    0.3 -> 0.0213 voxel off a rigid motion",
+        "tissue 3 (incompressible, sliding)  determinant within 4 % -> 0.81 %, volume -2 % -> +0.02 %",
+        "tissue 5 (stiff)                    0.0213 voxel off a rigid motion, volume +0.02 %",
+        "tissue 7 (free, sliding)            volume +0.02 %",
+    ):
+        assert line in out
+    first = json.loads((folder / "out" / "result.json").read_text(encoding="utf-8"))
+    assert first["inputs"]["tissue"] == "tissue.png"
+    assert first["settings"]["tissues"] == {"1": "rigid", "3": {"div": 50.0, "strain": 5.0}}
+    assert first["settings"]["sliding"] == [3]
+    assert torchdeform([*shlex.split(first["command"]), "--quiet"]) == 0
+    again = json.loads((folder / "out" / "result.json").read_text(encoding="utf-8"))
+    assert (again["settings"], again["inputs"]) == (first["settings"], first["inputs"])
+    assert seen == [[0, 1, 3]] * 2
+
+
 @pytest.mark.parametrize(
     ("prepare", "arguments", "message"),
     [
+        (None, [*PAIR, "--set", "tissues.1=rigid"], "tissues and sliding name labels (1), but there is no --tissue"),
+        (_tissue(2, 5), WITH_TISSUE, "tissue.png has the labels 2, 5, and the settings say what they are: add --set"),
+        (_tissue(2), [*WITH_TISSUE, "--set", "sliding=[3]"], "tissue.png has no label 3, which sliding names; it has"),
+        (_tissue(2), [*WITH_TISSUE, "--set", "sliding=2", "--symmetric"], "symmetric: tissue is known of the fixed"),
+        (_tissue(2), [*WITH_TISSUE, "--set", "tissues.2=rigd"], "did you mean 'rigid'?"),
+        (_tissue(2), [*WITH_TISSUE, "--set", "tissue.2=rigid"], "did you mean 'tissues'?"),
+        (None, [*WITH_TISSUE, "--set", "tissues.1=rigid"], "tissue.png does not exist"),
+        (None, [*PAIR, "--tissue", "fixed.nii.gz", "--set", "tissues.1=rigid"], "tissue: fixed.nii.gz must be 2D with"),
+        (None, [*PAIR, "--tissue", "moving.png", "--set", "tissues.1=rigid"], "tissue: moving.png must be 2D with one"),
         (None, ["fixed.png", "movin.png"], "movin.png does not exist; check the name; did you mean 'moving.png'?"),
         (None, ["fixed.png", "."], ". is a folder"),
         (None, ["fixed.png", "moving.nii.gz"], "fixed.png is 2D but moving.nii.gz is 3D"),

@@ -86,6 +86,35 @@ def test_what_goes_along_is_no_image_of_its_own(touch, cohort_of):
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("pairing", "tissues"),
+    [
+        ("all, both_ways: true", {("1", "2"): "t1", ("2", "1"): "t2"}),
+        ("consecutive", {("1", "2"): "t1"}),
+        ("group, reference: {n: '2'}", {("2", "1"): "t2"}),
+        ("template, fixed: 2.png", {("2", "1"): "t1"}),  # as all files of a template's pair, by the moving image
+    ],
+)
+def test_tissue_is_of_the_fixed_image_and_no_image_of_its_own(touch, cohort_of, pairing, tissues):
+    touch(["1.png", "2.png", "t1.png", "t2.png"])
+    found = pair_specs(
+        cohort_of(f"pairs: {{pattern: {{files: '{{n}}.png', tissue: 't{{n}}.png', pairing: {pairing}}}}}\n")
+    )
+    assert {
+        tuple(pair.files[side].stem for side in ("fixed", "moving")): pair.files["tissue"].stem for pair in found
+    } == (tissues)
+    assert all(len(pair.files) == 3 for pair in found)
+
+
+def test_tissue_may_be_missing_where_it_is_not_needed(touch, cohort_of):
+    touch(["1.png", "2.png", "3.png", "t1a.png"])
+    found = pair_specs(cohort_of("pairs: {pattern: {files: '{n}.png', tissue: 't{n}*.png', pairing: consecutive}}\n"))
+    assert [pair.files.get("tissue") is not None for pair in found] == [True, False]
+    assert "t2*.png must match one file, but no file matches" in found[1].problem
+    with pytest.raises(InputError, match="tissue: there is no part 'm'"):
+        cohort_of("pairs: {pattern: {files: '{n}.png', tissue: 't{m}.png', pairing: all}}\n")
+
+
 def test_a_mask_that_cannot_be_told_is_a_problem_of_its_pair(touch, cohort_of):
     touch(["1.png", "2.png", "3.png", "m1a.tif", "m2a.tif", "m2b.tif", "m3a.tif"])
     found = pair_specs(cohort_of("pairs: {pattern: {files: '{n}.png', masks: 'm{n}*.tif', pairing: all}}\n"))

@@ -61,6 +61,40 @@ def test_missing_files_are_problems_and_the_rest_is_not(touch, cohort_of, tmp_pa
     assert "moving_mask" in sentences[2]
 
 
+def test_tissue_goes_with_its_settings(touch, cohort_of, tmp_path):
+    """Labels 1 of one and 2 of another pair; a pair without labels, and labels that nothing is said of."""
+    touch(["a.png", "b.png", "c.png", "d.png", "bones.nii"])
+    rows = [
+        "fixed,moving,tissue,settings.tissues.2,settings.symmetric",
+        "a.png,b.png,bones.nii,,",
+        "a.png,c.png,bones.nii,{div: 50},",
+        "a.png,d.png,,,",
+        "b.png,c.png,bones.nii,,true",
+        "b.png,d.png,skin.nii,,",
+    ]
+    (tmp_path / "t.csv").write_text("\n".join(rows), encoding="utf-8")
+    text = "settings: {tissues: {1: rigid}, sliding: [4]}\npairs: {table: {file: t.csv}}\n"
+    cohort = cohort_of(text)
+    work = plan(cohort)
+    assert [job.settings.tissues for job in work.jobs] == [{1: "rigid"}, {1: "rigid", 2: {"div": 50.0}}]
+    assert all(job.files.tissue == tmp_path / "bones.nii" and job.settings.sliding == (4,) for job in work.jobs)
+    sentences = [problem.sentence for problem in work.problems]
+    assert sentences[0] == (
+        "tissues and sliding name labels (1, 4), but there is no tissue; give the labels of the fixed image; see "
+        f"{tmp_path / 't.csv'} line 4"
+    )
+    assert "symmetric: tissue is known of the fixed image only" in sentences[1]
+    assert "skin.nii does not exist" in sentences[2]
+    assert "1: rigid" in cohort.to_yaml()
+    (said,) = plan(cohort_of("pairs: {list: [{fixed: a.png, moving: b.png, tissue: bones.nii}]}\n")).problems
+    assert "the settings do not say what the labels of tissue are, as tissues: {1: rigid} does; see" in said.sentence
+
+
+def test_settings_of_tissue_are_wrong_where_they_stand(cohort_of):
+    with pytest.raises(InputError, match=r"cohort.yaml line 3: settings: tissues: label 2 .* did you mean 'rigid'\?"):
+        cohort_of("settings:\n  tissues: {2: rgid}\n")
+
+
 @pytest.mark.parametrize(
     ("pairs", "sentence"),
     [

@@ -41,6 +41,12 @@ def test_everything_is_written(built):
     assert not (built.folder / "rounds" / "1" / "pairs" / "sub-0").exists()  # the reference itself
 
 
+def test_a_template_has_no_tissue(tmp_path):
+    write_images(tmp_path / "images")
+    with pytest.raises(InputError, match="tissues and sliding are for pairs, a template has none; remove them"):
+        build(cohort(tmp_path).model_copy(update={"settings": {"sliding": [1]}}))
+
+
 def test_it_is_what_the_library_makes(built):
     images = [read_image(built.folder.parent / "images" / f"sub-{i}.nii.gz") for i in range(3)]
     wanted = build_template(images, cohort(built.folder.parent).resolve(), rounds=2)

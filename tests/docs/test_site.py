@@ -91,6 +91,7 @@ def test_every_preset_is_shown():
 def test_pictures_are_made_by_the_build_and_small(site):
     files = list((site / "pictures").iterdir())
     names = {"report", "overview", "brains", "lungs", "hearts", "histology", "contrasts", "grids", "volume-change"}
+    names |= {"tissue", "bones", "breast", "breathing"}
     assert {path.name for path in files} == {f"{name}.jpg" for name in names}
     assert not (ROOT / "docs" / "pictures").exists()
     assert all(5_000 < path.stat().st_size < 250_000 for path in files)

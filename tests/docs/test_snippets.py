@@ -99,6 +99,7 @@ def test_commands_run(page, workplace, quick, capsys, monkeypatch):
             ran += run(words, line, capsys)
         elif words[:2] == ["python", "scripts/phantoms.py"]:
             monkeypatch.setattr(sys, "argv", words[1:])
+            monkeypatch.syspath_prepend(str(ROOT / "scripts"))  # as Python does for a script
             runpy.run_path(words[1], run_name="__main__")
         else:
             assert words[0] in ("python", *OTHERS), line

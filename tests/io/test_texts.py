@@ -56,6 +56,11 @@ def test_values_that_are_texts_here():
     assert math.isnan(parse_yaml(".nan", "a"))
 
 
+def test_whole_numbers_as_keys_are_texts():
+    """As labels are written; nothing else that YAML reads is a name."""
+    assert parse_yaml("{1: a, 0x10: {2: b}, '3': c}", "a") == {"1": "a", "16": {"2": "b"}, "3": "c"}
+
+
 def multiplied(levels: int) -> str:
     first = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]"
     return "\n".join([first, *(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, levels))])
@@ -85,7 +90,8 @@ def merged(levels: int) -> str:
         ("a: 1" + ":59" * 100_000, "digits is too long"),
         ("a: 18446744073709551616", "18446744073709551616 is too large a number"),
         ("true: 1", "the key True is no text; write it in quotes"),
-        ("5: 1", "the key 5 is no text"),
+        ("5.5: 1", "the key 5.5 is no text"),
+        ("5: 1\n'5': 2", "5 is given twice"),
         ("? [a, b]\n: c", "the key .* is no text"),
         ("? {a: b}\n: c", "the key .* is no text"),
         ('a: "\\0"', "has a character that no file and no name can have"),
@@ -106,7 +112,7 @@ def merged(levels: int) -> str:
         ("a: 1\n---\nb: 2", "another document"),
         ("a: b: c", "mapping values are not allowed"),
     ],
-    ids=range(36),
+    ids=range(37),
 )
 def test_yaml_that_is_refused(text, sentence):
     with pytest.raises(InputError, match=sentence) as raised:

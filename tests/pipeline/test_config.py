@@ -8,6 +8,7 @@ from torchdeform.errors import InputError
 from torchdeform.pipeline.config import (
     configs_folder,
     load_settings,
+    merged_settings,
     parse_override,
     preset_names,
     read_yaml,
@@ -46,6 +47,32 @@ def test_later_layers_win(tmp_path):
     settings = load_settings("fast", file, {"optimiser.steps": [3], "flow.steps": 2})
     assert (settings.similarity.window, settings.optimiser.steps, settings.optimiser.momentum) == (7, (3,), 0.1)
     assert (settings.flow.method, settings.flow.steps) == ("rk4", 2)
+
+
+@pytest.mark.parametrize(
+    ("given", "tissues"),
+    [
+        ({}, {1: {"div": 3.0, "strain": 5.0}, 2: "stiff"}),
+        ({"tissues.1": "rigid"}, {1: "rigid", 2: "stiff"}),
+        ({"tissues.1": {"div": 9}}, {1: {"div": 9.0}, 2: "stiff"}),
+        ({"tissues.1.div": "1e4"}, {1: {"div": 1e4, "strain": 5.0}, 2: "stiff"}),
+        ({"tissues.2.div": 9, "tissues.2.strain": 1}, {1: {"div": 3.0, "strain": 5.0}, 2: {"div": 9.0, "strain": 1.0}}),
+        ({"tissues": {"1": {"div": 9}, 3: "free"}}, {1: {"div": 9.0}, 2: "stiff", 3: "free"}),
+    ],
+)
+def test_a_label_is_one_whoever_names_it(tmp_path, given, tissues):
+    """In YAML, after a dot, and in Python; prices that are given as a whole take the place of others."""
+    file = _file(tmp_path, "tissues: {1: {div: 3, strain: 5}, 2: stiff}\nsliding: 2")
+    settings = load_settings(file=file, overrides=given)
+    assert (settings.tissues, settings.sliding) == (tissues, (2,))
+    merged = merged_settings({"tissues": {"1": {"div": 3, "strain": 5}, "2": "stiff"}}, given)
+    assert load_settings(overrides=merged).tissues == tissues
+
+
+@pytest.mark.parametrize("label", [True, 1.5, None, 10**30, "1.5", "", " 1"])
+def test_only_whole_numbers_are_labels(label):
+    with pytest.raises(InputError, match=r"settings: tissues: .* is no label"):
+        load_settings(overrides={"tissues": {label: "rigid"}})
 
 
 def test_empty_file_changes_nothing(tmp_path):
@@ -93,7 +120,22 @@ def test_malformed_overrides(text):
         (f"optimiser: {{step_length: {'9' * 400}}}", "is too large a number"),
         (f"{'a.' * 300}b: 1", r"there is no setting 'a'"),
         ("- window", "must hold 'key: value' lines"),
-        ("5: window", "at line 1: the key 5 is no text; write it in quotes"),
+        ("5: window", "settings.yaml: there is no setting '5'"),
+        ("5.5: window", "at line 1: the key 5.5 is no text; write it in quotes"),
+        ("similarity: {lncc: x}", r"settings.yaml: similarity.measure.lncc = 'x': Input should be a valid number"),
+        ("tissues: rigid", r"settings.yaml: tissues gives each label its kind, such as \{1: rigid\}, got 'rigid'"),
+        ("tissues:", "settings.yaml: tissues gives each label its kind, .*, got None"),
+        ("tissues: {bone: rigid}", "settings.yaml: tissues: 'bone' is no label, which is a whole number from 1"),
+        ("tissues: {-1: rigid}", "settings.yaml: tissues: '-1' is no label"),
+        ("tissues: {0: rigid}", "settings.yaml: tissues: labels are whole numbers from 1"),
+        ("tissues: {1: rigd}", r"settings.yaml: tissues: label 1 must be one of .*; did you mean 'rigid'\?"),
+        ("tissues: {1: [rigid]}", r"settings.yaml: tissues: label 1 is one of free, .*, got \['rigid'\]"),
+        ("tissues: {1: {dvi: 3}}", r"tissues: label 1 must be one of div, strain, curl, .*did you mean 'div'\?"),
+        ("tissues: {1: {div: x}}", "settings.yaml: tissues.1.div = 'x': Input should be a valid number"),
+        ("tissues: {1: {div: -1}}", "settings.yaml: tissues: label 1: div must be finite and positive, got -1"),
+        ("tissues: {1: rigid, '1': free}", "at line 1: 1 is given twice"),
+        ("sliding: [lung]", "settings.yaml: sliding.0 = 'lung': Input should be a valid integer"),
+        ("sliding: [0]", "settings.yaml: sliding: labels are whole numbers from 1"),
         ("window: !!python/object/apply:os.getcwd []", "is no valid YAML"),
     ],
 )

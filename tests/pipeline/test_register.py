@@ -69,3 +69,34 @@ def test_a_limit_of_memory_is_kept_to_where_less_is_free(folder, monkeypatch):
     """The check before it refuses nothing that will be made to fit."""
     monkeypatch.setattr("torchdeform.pipeline.preflight.available", lambda device: 10**8)
     assert main(["fixed.nrrd", "moving.nrrd", "--memory", "1GB", "--preset", "fast", "--out", "out", "--quiet"]) == 0
+
+
+def test_a_rigid_label_is_rigid_in_the_file_too(folder):
+    """As SimpleITK reads it, alignment and all, on labels of another type; what the record says is what it finds."""
+    labels = sitk.Cast(sitk.ReadImage("fixed_labels.nrrd"), sitk.sitkUInt16)
+    sitk.WriteImage(labels, "tissue.nii.gz")
+    how = [
+        "--tissue",
+        "tissue.nii.gz",
+        "--set",
+        "tissues.700=rigid",
+        "--set",
+        "optimiser.steps=[2, 2]",
+        "--out",
+        "out",
+        "--report",
+        "none",
+    ]
+    assert main(["fixed.nrrd", "moving.nrrd", *how, "--quiet"]) == 0
+    record = json.loads((folder / "out" / "result.json").read_text(encoding="utf-8"))
+    (told,) = record["tissue"]
+    inside = np.argwhere(sitk.GetArrayFromImage(labels) == 700)
+    assert (told["label"], told["kind"], told["nodes"]) == (700, "rigid", len(inside))
+    assert record["alignment"]["kind"] == "rigid"
+    transform = sitk.ReadTransform("out/transform.h5")
+    here = np.array([labels.TransformIndexToPhysicalPoint([int(k) for k in node[::-1]]) for node in inside])
+    there = np.array([transform.TransformPoint(point) for point in here])
+    here, there = here - here.mean(0), there - there.mean(0)
+    left, _, right = np.linalg.svd(here.T @ there)
+    assert np.abs(here @ left @ right - there).max() < 0.01
+    assert told["after"]["residual"] < 0.01

@@ -12,6 +12,7 @@ from torch import nn
 
 from torchdeform import nn as layers
 from torchdeform.core.grid import Grid
+from torchdeform.fem import Weights
 
 GRIDS = [Grid((16, 12), (1.0, 1.5)), Grid((8, 9, 10))]
 
@@ -31,6 +32,20 @@ class Pipeline(nn.Module):
         return self.warp(pair[:, 1:], self.head(self.network(pair)))
 
 
+class PredictedWeights(nn.Module):
+    """A network that says what divergence, curl and strain cost in every element of the solve after it."""
+
+    def __init__(self, grid: Grid) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.network = {2: nn.Conv2d, 3: nn.Conv3d}[grid.dim](2, 3, 2)
+        self.solve = layers.DivCurlVelocity(grid)
+
+    def forward(self, pair: torch.Tensor) -> torch.Tensor:
+        div, curl, strain = (nn.functional.softplus(self.network(pair)) + 0.1).chunk(3, dim=1)
+        return self.solve(pair[:, :1] - pair[:, 1:], weights=Weights(div, curl, 0.1, strain))
+
+
 def pairs(grid: Grid, items: int) -> torch.Tensor:
     return torch.rand(items, 2, *grid.shape, generator=torch.Generator().manual_seed(items))
 
@@ -46,6 +61,8 @@ def modules(grid: Grid) -> dict[str, tuple[nn.Module, tuple[torch.Tensor, ...]]]
         "FlowIntegrator rk4": (layers.FlowIntegrator(grid, "rk4", steps=2), (u,)),
         "FlowIntegrator midpoint": (layers.FlowIntegrator(grid, "midpoint", steps=3), (u,)),
         "DivCurlVelocity cg": (layers.DivCurlVelocity(grid, "dirichlet", weight_div=2.0), (image,)),
+        "DivCurlVelocity weights": (layers.DivCurlVelocity(grid, weights=stiff_inside(grid)), (image,)),
+        "PredictedWeights": (PredictedWeights(grid), (pairs(grid, 2),)),
         "Pipeline": (Pipeline(grid), (pairs(grid, 2),)),
         "DeterminantLoss": (layers.DeterminantLoss(grid), (u,)),
         "DivergenceLoss": (layers.DivergenceLoss(grid), (u,)),
@@ -55,6 +72,13 @@ def modules(grid: Grid) -> dict[str, tuple[nn.Module, tuple[torch.Tensor, ...]]]
         "ssd": (layers.SimilarityLoss("ssd"), (image, image.flip(2))),
         "ncc": (layers.SimilarityLoss("ncc"), (image, image.flip(2))),
     }
+
+
+def stiff_inside(grid: Grid) -> Weights:
+    """Return weights that are parameters and say that the middle keeps its shape."""
+    strain = torch.full((1, 1, *[n - 1 for n in grid.shape]), 0.1)
+    strain[(..., *[slice(2, -2)] * grid.dim)] = 10.0
+    return Weights(strain=nn.Parameter(strain))
 
 
 @pytest.mark.parametrize("grid", GRIDS, ids=["2D", "3D"])
@@ -75,8 +99,9 @@ def test_compiles_to_one_graph(name, grid):
 
 
 @pytest.mark.parametrize("grid", GRIDS, ids=["2D", "3D"])
-def test_exports_for_any_batch(grid):
-    model = Pipeline(grid).eval()
+@pytest.mark.parametrize("kind", [Pipeline, PredictedWeights])
+def test_exports_for_any_batch(kind, grid):
+    model = kind(grid).eval()
     program = torch.export.export(model, (pairs(grid, 2),), dynamic_shapes=({0: torch.export.Dim("B")},))
     with torch.no_grad():
         for items in (1, 2, 5):
@@ -84,11 +109,12 @@ def test_exports_for_any_batch(grid):
 
 
 @pytest.mark.parametrize("grid", GRIDS, ids=["2D", "3D"])
-def test_copies_and_saved_states_are_the_same(grid, tmp_path):
-    model = Pipeline(grid)
+@pytest.mark.parametrize("kind", [Pipeline, PredictedWeights])
+def test_copies_and_saved_states_are_the_same(kind, grid, tmp_path):
+    model = kind(grid)
     model(pairs(grid, 1)).sum().backward()  # whatever is kept from a run must not get in the way
     torch.save(model.state_dict(), tmp_path / "state.pt")
-    loaded = Pipeline(grid)
+    loaded = kind(grid)
     loaded.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
     for twin in (copy.deepcopy(model), pickle.loads(pickle.dumps(model)), loaded):
         assert torch.equal(twin(pairs(grid, 2)), model(pairs(grid, 2)))
@@ -108,8 +134,9 @@ def test_every_layer_says_what_it_is():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 @pytest.mark.parametrize("grid", GRIDS, ids=["2D", "3D"])
-def test_moves_to_a_gpu(grid):
-    model = Pipeline(grid)
+@pytest.mark.parametrize("kind", [Pipeline, PredictedWeights])
+def test_moves_to_a_gpu(kind, grid):
+    model = kind(grid)
     here = model(pairs(grid, 2))
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # or the network's convolutions have 10 bits
         there = copy.deepcopy(model).cuda()(pairs(grid, 2).cuda())

@@ -66,6 +66,7 @@ def _calls(grid: td.Grid) -> dict[str, Callable[[], Tensor]]:
     rigid[..., :3] = True
     u = 0.3 * torch.sin(grid.points() / 4)
     marks = replace(QUICK, points_weight=0.1)
+    weights = td.Weights(curl=0.0, zero=0.1, strain=labels[(..., *[slice(1, None)] * grid.dim)] + 0.5)
     generator = torch.Generator("cpu").manual_seed(1)
     return {
         "register": lambda: td.register(fixed, moving, QUICK).displacement,
@@ -80,6 +81,10 @@ def _calls(grid: td.Grid) -> dict[str, Callable[[], Tensor]]:
         "version 3": lambda: td.track_moving_monitor(lambda t: 1 + t * fixed, grid, [0.0, 1.0]),
         "volumes": lambda: td.simulate_volume_change(labels, {1: 0.95}, grid).value,
         "volumes, rigid": lambda: td.simulate_volume_change(labels * ~rigid, {1: 0.95}, grid, rigid_mask=rigid).value,
+        "rigid label": lambda: td.hold_rigid(u, rigid, grid),
+        "incompressible label": lambda: td.hold_volume(u, labels == 1, grid, still=rigid),
+        "label fit": lambda: torch.cat(td.label_fit(u, rigid, grid)),
+        "slip": lambda: td.from_jacobian_and_curl(fixed, td.curl(0 * u, grid), grid, boundary="slip").value,
         "average": lambda: td.average_maps([0.1 * u, -0.1 * u], grid).value,
         "monitors": lambda: td.gradient_monitor(fixed, grid) + td.curvature_monitor(fixed, grid),
         "solve": lambda: td.solve_div_curl(fixed, None, grid).value,
@@ -90,6 +95,7 @@ def _calls(grid: td.Grid) -> dict[str, Callable[[], Tensor]]:
             layers.SimilarityLoss(name)(fixed, moving) for name in ("ssd", "ncc", "lncc", "mi", "nmi", "ngf", "mind")
         ]),
         "layer": lambda: layers.DeformableRegistration(grid, steps=2)(fixed, moving),
+        "weights": lambda: layers.DivCurlVelocity(grid, weights=weights)(fixed),
         "augmentation": lambda: layers.RandomDeformation(grid)(fixed, generator=generator),
     }  # fmt: skip
 

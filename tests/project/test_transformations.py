@@ -29,9 +29,13 @@ def _cases(dim: int) -> dict[str, tuple[Callable[[Tensor], Tensor], Tensor]]:
     def weighted(x: Tensor) -> Tensor:
         return td.solve_div_curl(div[:1], curl[:1], grid, weights=td.Weights(div=x), solver=exact["cg"]).value
 
+    def predicted(x: Tensor) -> Tensor:
+        return layers.DivCurlVelocity(grid)(div, curl, weights=td.Weights(div=2.0, curl=0.5, zero=0.1, strain=x))
+
     return {
         **{how: (solved(how), div) for how in exact},
         "weights": (weighted, weight),
+        "predicted weights": (predicted, weight),
         "velocity": (lambda x: layers.DivCurlVelocity(grid)(x, curl), div),
         "head": (layers.JacobianCurlHead(2, grid).double(), features),
         "flow": (lambda x: td.integrate(x, grid), v),
@@ -61,6 +65,12 @@ def test_vmap_is_a_loop(name):
     torch.testing.assert_close(vmap(function)(many), torch.stack([function(y) for y in many]))
     slopes = vmap(grad(lambda y: function(y).square().sum()))(many)
     torch.testing.assert_close(slopes, torch.stack([grad(lambda y: function(y).square().sum())(y) for y in many]))
+
+
+def test_vmap_over_weights_of_the_function_is_refused():
+    function, x = _cases(2)["weights"]
+    with pytest.raises(td.InputError, match=r"vmap cannot run over weights here; give them as one batch"):
+        vmap(function)(torch.stack([x, 2 * x]))
 
 
 def test_parameters_of_the_head_have_gradients():

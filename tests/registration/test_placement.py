@@ -68,6 +68,30 @@ def test_a_shift_is_found_and_taken(shape):
     assert placed.unaligned.item() < 0.9
 
 
+@pytest.mark.parametrize(
+    ("tissues", "kind", "found"),
+    [
+        ({}, "affine", "affine"),
+        ({1: "stiff", 2: {"div": 1e4}, 3: "free"}, "affine", "affine"),
+        ({1: "stiff", 2: "rigid"}, "affine", "rigid"),
+        ({2: "incompressible"}, "similarity", "rigid"),
+        ({2: "rigid"}, "translation", "translation"),
+        ({2: "rigid"}, "none", "none"),
+    ],
+)
+def test_tissue_that_is_kept_is_aligned_rigidly(tissues, kind, found):
+    """The map is that of the deformation and of the alignment, and each of them must keep what is to be kept."""
+    image = as_image(blobs((32, 36), 1))
+    longer = replace(image, grid=Grid((32, 36), (1.0, 1.1)))
+    settings = replace(SETTINGS, tissues=tissues, align=kind)
+    placed = place(image, longer, settings, Annotations())
+    assert placed.settings.align.kind == found
+    if found == "rigid":
+        assert placed.affine is not None
+        matrix = placed.affine.matrix
+        torch.testing.assert_close(matrix @ matrix.T, torch.eye(2, dtype=matrix.dtype))
+
+
 def test_an_alignment_that_does_not_help_is_not_taken(monkeypatch):
     """Whatever the alignment says of itself: full detail decides."""
     image = as_image(blobs((64, 64), 1), "fixed")

@@ -9,6 +9,7 @@ import torch
 from torchdeform.core.grid import Grid
 from torchdeform.errors import InputError
 from torchdeform.metrics.evaluation import Evaluation, Measures
+from torchdeform.registration.tissue import TissueFit, TissueOutcome
 from torchdeform.registration.verdict import BAD, GOOD, LOOK, judge, number
 
 GRID = Grid((40, 50))
@@ -105,6 +106,27 @@ def test_distances_are_in_the_unit_of_the_file(fine_evidence):
     small = Grid((40, 50), (0.001, 0.001))
     verdict = judge(fine_evidence, small, folds=0, evaluation=landmarks([0.004], [0.002]), unit="µm")
     assert "mean distance 4 → 2 µm" in verdict.findings[-1].text
+
+
+@pytest.mark.parametrize(
+    ("kind", "fit", "words"),
+    [
+        ("rigid", (0.49, 0.3, 1.1), None),
+        ("rigid", (0.812, 0.3, 1.1), "The tissue of label 7 did not stay rigid (up to 0.812 voxels off its motion)."),
+        ("rigid", (math.nan, math.nan, math.nan), None),
+        ("incompressible", (3.0, 0.04, 1.0), None),
+        ("incompressible", (0.0, 0.062, 1.0), "did not keep its volume (the determinant is up to 6% off 1)."),
+        ("stiff", (3.0, 0.5, 1.4), None),
+        ("own", (3.0, 0.5, 1.4), None),
+    ],
+)
+def test_tissue_that_is_not_what_it_was_to_be_is_a_reason_to_look(fine_evidence, kind, fit, words):
+    after = TissueFit(*(torch.tensor([value], dtype=torch.float64) for value in fit))
+    outcome = TissueOutcome(7, kind, False, torch.tensor([9]), after, after)
+    verdict = judge(fine_evidence, GRID, folds=0, tissue=(outcome,))
+    assert verdict.kind == (GOOD if words is None else LOOK)
+    assert words is None or words in verdict.findings[0].text
+    assert words is None or "label 7 did not" in verdict.headline
 
 
 def test_folds_are_bad_and_counted(fine_evidence):

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from torchdeform.registration.problem import Annotations
+from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report import make_report_data
 from torchdeform.report.marks import landmark_colours
 
@@ -84,3 +85,20 @@ def test_labels_of_both_images_are_drawn_where_they_are(make_image, make_result)
     np.testing.assert_allclose(found["warped"].min(0), (10.5, 9.5))
     plain = make_report_data(image, image, result).slices[0].marks
     assert {mark.image for mark in plain if mark.kind == "outlines"} == {"fixed"}
+
+
+def test_tissue_is_drawn_where_settings_name_it_in_the_fixed_image_alone(make_image, make_result):
+    """Other labels of the file are not drawn, and the moving image has none; on a grid of their own, too."""
+    image, fine = make_image((40, 50)), make_image((79, 99), (0.5, 0.5))
+    labels = torch.zeros_like(fine.data)
+    labels[..., 20:40, 30:60], labels[..., 50:60, 30:60] = 3.0, 4.0
+    settings = RegistrationSettings(tissues={3: "rigid"}, sliding=(9,))
+    result = make_result(image, image, settings)
+    given = Annotations(tissue=replace(fine, data=labels))
+    marks = make_report_data(image, image, result, annotations=given).slices[0].marks
+    (mark,) = (mark for mark in marks if mark.kind == "tissue")
+    assert (mark.image, mark.colour) == ("fixed", "#009e73")
+    points = _points(marks[mark])
+    np.testing.assert_allclose((points.min(0), points.max(0)), ((14.5, 9.5), (29.5, 19.5)))
+    bare = replace(result, settings=RegistrationSettings())
+    assert not any(m.kind == "tissue" for m in make_report_data(image, image, bare, annotations=given).slices[0].marks)

@@ -31,6 +31,20 @@ def test_record_is_plain_json(tmp_path, make_image, make_result):
     assert set(record["versions"]) == {"torchdeform", "torch", "python"}
 
 
+def test_tissue_is_told_by_label(tmp_path, make_full):
+    write_json(make_full(3)[1], tmp_path / "result.json")
+    record = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
+    assert record["settings"]["tissues"] == {"1": "rigid", "2": "incompressible", "3": "stiff", "14": {"div": 50.0}}
+    first, *_, last = record["tissue"]
+    assert first == {
+        "label": 1, "kind": "rigid", "sliding": False, "nodes": 1234,
+        "before": {"residual": 0.3123, "off": 0.04, "volume": 1.01},
+        "after": {"residual": 0.02, "off": 1e-4, "volume": 1.0},
+    }  # fmt: skip
+    assert (last["sliding"], last["nodes"], last["before"]["volume"]) == (True, 0, None)
+    assert make_full(2, tissue=False)[1]["tissue"] == []
+
+
 @pytest.mark.parametrize(("unit", "factor"), [("px", 1), ("mm", 1), ("µm", 1000)])
 def test_distances_are_in_the_unit_of_the_fixed_image(make_full, unit, factor):
     _, record = make_full(2, unit=unit)

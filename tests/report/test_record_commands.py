@@ -19,6 +19,7 @@ FILES = {"fixed": "a b.png", "moving": "it's.png", "out": "$HOME", "fixed_points
     [
         *map(load_settings, preset_names()),
         settings_of(similarity={"lncc": 1.0, "mi": 0.5}, tolerance=1e-6, symmetric=True, length_scale=7.0),
+        RegistrationSettings(tissues={1: "rigid", 12: {"div": 100.0, "strain": 10.0, "curl": 0.0}}, sliding=(3, 1)),
     ],
 )
 def test_the_settings_come_back(settings):

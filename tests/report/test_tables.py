@@ -27,8 +27,19 @@ def test_the_worst_label_comes_first_and_long_tables_are_folded(record):
     assert found["Time and memory"].parts[0].rows[0] == ["read", "0.1 s", "0.10 GB"]
 
 
+def test_tissue_is_shown_before_and_after(record):
+    (part,) = next(table.parts for table in tables(record) if table.title == "Tissue")
+    assert [list(row) for row in part.rows] == [
+        ["1", "rigid", "1,234", "0.312 → 0.02", "4 % → 0.01 %", "+1 % → +0 %"],
+        ["2", "incompressible", "1,234", "2 → 2.1", "4.1 % → 0.8 %", "-2.1 % → +0.02 %"],
+        ["3", "stiff", "1,234", "1.5", "20 %", "+12 %"],
+        ["14", "own prices, sliding", "0", "–", "–", "–"],
+    ]
+    assert part.head[3:] == ["off a rigid motion", "determinant within", "volume"]
+
+
 def test_what_is_not_known_has_no_table(record):
-    bare = record | {"evaluation": {}, "levels": []}
+    bare = record | {"evaluation": {}, "levels": [], "tissue": []}
     titles = [table.title for table in tables(bare)]
     assert titles == ["Time and memory", "Files", "Settings and versions"]
 

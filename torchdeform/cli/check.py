@@ -14,6 +14,7 @@ from torchdeform.cli.options import (
     MovingLabels,
     MovingMask,
     MovingPoints,
+    Tissue,
     choice,
     print_json,
 )
@@ -27,6 +28,7 @@ from torchdeform.io.points import read_points
 from torchdeform.pipeline.annotations import check_annotations
 from torchdeform.pipeline.config import load_settings
 from torchdeform.pipeline.preflight import ERROR, Finding, Report, preflight
+from torchdeform.pipeline.tissue import check_tissue
 from torchdeform.registration.affine.settings import ALIGNMENTS
 from torchdeform.registration.placement import place
 from torchdeform.registration.problem import Annotations
@@ -51,6 +53,7 @@ def check(
     moving_points: MovingPoints = None,
     fixed_labels: FixedLabels = None,
     moving_labels: MovingLabels = None,
+    tissue: Tissue = None,
     align: Align = "affine",
     out: Picture = None,
     json: Json = False,
@@ -71,6 +74,7 @@ def check(
     more = (
         *_check_annotations(images[0], FIXED, fixed_points, fixed_labels),
         *_check_annotations(images[1], MOVING, moving_points, moving_labels),
+        *([] if tissue is None else check_tissue(images[0], read_labels(tissue))),
     )
     report = Report.made_of(*found.findings, *more)
     predicted = None if report.of(ERROR) else _predicted(*images, *masks, align)

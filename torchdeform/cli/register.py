@@ -19,6 +19,7 @@ from torchdeform.cli.options import (
     MovingPoints,
     Out,
     Quiet,
+    Tissue,
     Version,
     choice,
     flag,
@@ -36,9 +37,11 @@ from torchdeform.pipeline.config import load_settings, parse_override, preset_na
 from torchdeform.pipeline.register import REPORT, REPORTS, Outcome, PairFiles, register_files
 from torchdeform.registration.affine.settings import ALIGNMENTS
 from torchdeform.registration.verdict import BAD, GOOD, LOOK, MARKS, WARNED
+from torchdeform.report.tables import KEPT, kind_of
 
 _BAD_RESULT = 3  # exit code
 _PLAIN_MARKS = {GOOD: "OK", LOOK: "!", BAD: "X"}  # for terminals without Unicode
+_SAID = {"rigid": ("residual",), "stiff": ("residual", "volume"), "incompressible": ("off", "volume")}  # of tissue
 _COLOURS = {GOOD: typer.colors.GREEN, LOOK: typer.colors.YELLOW, BAD: typer.colors.RED}
 
 Report = Annotated[str, choice(REPORTS, "Pictures: {}.", "KIND")]
@@ -78,6 +81,7 @@ def register(
     points_weight: PointsWeight = None,
     fixed_labels: FixedLabels = None,
     moving_labels: MovingLabels = None,
+    tissue: Tissue = None,
     symmetric: Symmetric = False,
     preset: Preset = "default",
     config: Config = None,
@@ -111,6 +115,7 @@ def register(
         moving_points=moving_points,
         fixed_labels=fixed_labels,
         moving_labels=moving_labels,
+        tissue=tissue,
     )
     limit = None if memory is None else parse_size(memory)
     with StepProgress(quiet) as bar:
@@ -138,6 +143,7 @@ def summary(outcome: Outcome) -> str:
         "folds": folds_text(r),
         "inverse consistency": inverse_text(r["inverse_error_mean"], r["inverse_error_max"]),
         **_measured(r),
+        **_kept(r),
         "seconds": f"{sum(r['seconds'].values()):.1f} on {r['device']}",
         "results": f"{outcome.folder}{os.sep} ({', '.join(r['files'])})",
     }
@@ -174,3 +180,14 @@ def _measured(record: dict[str, Any]) -> dict[str, str]:
         if figures:
             lines[name] = " -> ".join(figures) + unit
     return lines
+
+
+def _kept(record: dict[str, Any]) -> dict[str, str]:
+    """Return a line about each label of tissue: how far it is from what its kind asks for."""
+    said = {"residual": "{} voxel off a rigid motion", "off": "determinant within {}", "volume": "volume {}"}
+    return {
+        f"tissue {one['label']} ({kind_of(one)})": ", ".join(
+            said[key].format(KEPT[key](one, " -> ")) for key in _SAID.get(one["kind"], ("volume",))
+        )
+        for one in record["tissue"]
+    }

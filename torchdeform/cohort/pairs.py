@@ -1,7 +1,8 @@
 """The pairs of a cohort: from a list, a table, a Learn2Reg data set, or among the images that patterns find."""
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import fields
 from itertools import combinations, pairwise, permutations
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 from torchdeform.cohort.learn2reg import learn2reg_pairs
 from torchdeform.cohort.names import PairSpec, entity, image_name, pair_name, shared_parts, subject_of
 from torchdeform.cohort.patterns import FoundFile, fill_parts, find, natural_key, search, single_file
-from torchdeform.cohort.schema import COMPANIONS, Cohort, Images, Pair, PatternPairs, checked_name
+from torchdeform.cohort.schema import COMPANIONS, TISSUE, Cohort, Images, Pair, PatternPairs, checked_name
 from torchdeform.cohort.settings import absolute_path, expand
 from torchdeform.errors import InputError, nearest_name, require_choice, shown
 from torchdeform.io.files import suffix
@@ -32,7 +33,7 @@ def find_images(images: Images) -> list[FoundFile]:
         InputError: there is none.
 
     Notes:
-        A file with the labels, the mask or the landmarks of another one is no image, even if the pattern matches it.
+        A file with the labels, mask, landmarks or tissue of another one is no image, even if the pattern matches it.
     """
     if images.folder is not None and images.expression is not None:
         found = search(images.folder, images.expression)
@@ -71,11 +72,16 @@ def companions(one: FoundFile, images: Images, side: str) -> dict[str, Path]:
     return {f"{side}_{COMPANIONS[key]}": single_file(fill_parts(pattern, one.parts)) for key, pattern in patterns}
 
 
-def _existing_companions(one: FoundFile, images: Images) -> list[Path]:
-    try:
-        return list(companions(one, images, "").values())
-    except InputError:
-        return []
+def _existing_companions(one: FoundFile, images: Images) -> Iterator[Path]:
+    for pattern in (*images.companions().values(), *_tissue_of(images).values()):
+        with suppress(InputError):
+            yield single_file(fill_parts(pattern, one.parts))
+
+
+def _tissue_of(images: Images) -> dict[str, str]:
+    """Return the pattern of the tissue of fixed images, by its key, if there is one."""
+    pattern = getattr(images, TISSUE, None)
+    return {} if pattern is None else {TISSUE: pattern}
 
 
 def _template(moving: FoundFile, pattern: PatternPairs) -> Path | None:
@@ -121,7 +127,8 @@ def _between(fixed: FoundFile, moving: FoundFile, pattern: PatternPairs, where: 
     def files() -> dict[str, Path]:
         sides = (("fixed", fixed), ("moving", moving))
         found = {key: path for side, one in sides for key, path in companions(one, pattern, side).items()}
-        return {"fixed": fixed.path, "moving": moving.path, **found}
+        tissue = {key: single_file(fill_parts(text, fixed.parts)) for key, text in _tissue_of(pattern).items()}
+        return {"fixed": fixed.path, "moving": moving.path, **found, **tissue}
 
     name = pair_name(fixed.path, moving.path, fixed.parts, moving.parts)
     return _pair_spec(name, files, where, subject_of(shared_parts(fixed.parts, moving.parts)))

@@ -12,13 +12,14 @@ from torchdeform import __version__
 from torchdeform.cohort.learn2reg import submission_names
 from torchdeform.cohort.names import PairSpec, select
 from torchdeform.cohort.pairs import pair_specs
-from torchdeform.cohort.schema import Cohort
+from torchdeform.cohort.schema import TISSUE, Cohort
 from torchdeform.errors import InputError, nearest_name
 from torchdeform.io import read_displacement, read_image
 from torchdeform.io.files import atomic_file, atomic_folder
 from torchdeform.io.gate import read_text, require_file, require_name
 from torchdeform.io.transforms import write_voxel_displacement
 from torchdeform.pipeline.register import Outcome, PairFiles, register_files
+from torchdeform.pipeline.tissue import contradiction
 from torchdeform.registration.result import Callback
 from torchdeform.registration.settings import RegistrationSettings
 
@@ -65,7 +66,7 @@ _RESERVED = (
 )
 
 _POINTS = ("fixed_points", "moving_points")
-_WHAT = {"mask": "mask", "labels": "label image", "points": "file of landmarks"}
+_WHAT = {"mask": "mask", "labels": "label image", "points": "file of landmarks", TISSUE: "label image"}
 
 
 @dataclass(frozen=True)
@@ -127,11 +128,12 @@ def plan(cohort: Cohort) -> Plan:
     jobs: list[Job] = []
     problems: list[Failure] = []
     for pair in found:
-        sentence = pair.problem or _missing(pair) or _leading_out(pair, cohort.out)
+        settings = resolve(pair)
+        sentence = pair.problem or _missing(pair) or _leading_out(pair, cohort.out) or _misnamed_tissue(pair, settings)
         if sentence:
             problems.append(Failure(pair.name, sentence))
         else:
-            jobs.append(_job(pair, cohort, resolve(pair)))
+            jobs.append(_job(pair, cohort, settings))
     return Plan(cohort.out, tuple(jobs), tuple(problems))
 
 
@@ -186,7 +188,7 @@ def _missing(pair: PairSpec) -> str:
             require_name(path)
             if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises if a folder may not be read
                 return f"{key} {path} does not exist; check {pair.where}"
-            require_file(path, _WHAT.get(key.partition("_")[2], "image file"), folder=True)
+            require_file(path, _WHAT.get(key.rpartition("_")[2], "image file"), folder=True)
         except InputError as error:
             return f"{key} {error}; see {pair.where}"
     for what in ("points", "labels"):
@@ -195,6 +197,15 @@ def _missing(pair: PairSpec) -> str:
             other = {"fixed": "moving", "moving": "fixed"}[given[0]]
             return f"{given[0]}_{what} needs {other}_{what} too, give both or neither; check {pair.where}"
     return ""
+
+
+def _misnamed_tissue(pair: PairSpec, settings: RegistrationSettings) -> str:
+    """Return a sentence if a pair has labels of tissue and its settings say nothing of them, or the other way round."""
+    given = TISSUE in pair.files
+    if given and not settings.knows_tissue:
+        return f"the settings do not say what the labels of tissue are, as tissues: {{1: rigid}} does; see {pair.where}"
+    problem = contradiction(given, settings, "tissue")
+    return f"{problem}; see {pair.where}" if problem else ""
 
 
 def _leading_out(pair: PairSpec, out: Path) -> str:

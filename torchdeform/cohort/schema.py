@@ -29,6 +29,9 @@ from torchdeform.registration.settings import SHORT_FORMS, RegistrationSettings
 # Companions of an image by their keys here, with their names in a pair.
 COMPANIONS = {"labels": "labels", "masks": "mask", "points": "points"}
 
+# What is known of the fixed image of a pair alone, by its key here and in a pair.
+TISSUE = "tissue"
+
 # Keys that belong to one pairing only.
 _BELONGS = {
     **dict.fromkeys(("fixed", "fixed_labels", "fixed_mask", "fixed_points"), "template"),
@@ -114,6 +117,8 @@ class Pair(Strict):
     """Regions of the fixed image."""
     moving_labels: Place | None = None
     """The same regions of the moving image."""
+    tissue: Place | None = None
+    """Labels of tissue in the fixed image, for the settings tissues and sliding."""
     settings: Overrides = Field(default_factory=dict)
     """Settings of this pair that differ from the cohort's."""
 
@@ -184,6 +189,9 @@ class PatternPairs(Images):
     """template: its mask."""
     fixed_points: Pattern | None = None
     """template: its landmarks."""
+    tissue: Pattern | None = None
+    """Labels of tissue in the fixed image of each pair, for the settings tissues and sliding. {part} is the part of the
+    fixed image; template: of the moving image."""
     reference: dict[str, str] = Field(default_factory=dict)
     """group: parts of the fixed member, such as {session: pre}."""
     both_ways: bool = False
@@ -209,8 +217,8 @@ class PatternPairs(Images):
         return self
 
     def fixed_files(self) -> dict[str, str]:
-        """Return the patterns of a template's files, by their keys here."""
-        keys = ("fixed", "fixed_labels", "fixed_mask", "fixed_points")
+        """Return the patterns of a fixed image's own files, by their keys here: of a template's, and of its tissue."""
+        keys = ("fixed", "fixed_labels", "fixed_mask", "fixed_points", TISSUE)
         return {key: value for key in keys if (value := getattr(self, key)) is not None}
 
 

@@ -102,6 +102,10 @@ def build(cohort: Cohort, *, retry_failed: bool = False, report: Listener | None
         An image that cannot be registered in one round is left out of this round and of all later ones.
     """
     subjects = _subjects(cohort)
+    if cohort.resolve().knows_tissue:
+        raise InputError(
+            f"{cohort.path}: settings: tissues and sliding are for pairs, a template has none; remove them"
+        )
     require_writable(cohort.out)
     for place in (cohort.out / SUBJECTS, *(cohort.out / SUBJECTS).glob("*")):
         remove_leftovers(place)

@@ -113,10 +113,10 @@ def smooth_elastically(u: Tensor, share: Tensor, grid: Grid) -> Tensor:
 
     Args:
         u: displacement ``(B, D, *S)``; on the faces of the box the components that lead out of it stay as they are.
-        share: 0 to 1 for each item ``(B,)``.
+        share: from 0 to 1, what broadcasts to ``(B, 1, *S)``.
         grid: its grid.
     """
-    return keep_faces(torch.lerp(u, neighbour_mean(u), per_item(share, u)), u, grid)
+    return keep_faces(torch.lerp(u, neighbour_mean(u), share.expand_as(u)), u, grid)
 
 
 def neighbour_mean(field: Tensor) -> Tensor:

@@ -53,8 +53,15 @@ def average_maps(
         if not bool((det > 0).all()):
             raise InputError(f"average_maps: map {index} folds, its determinant falls to {float(det.min()):g}")
         log_det, rotation, mean = log_det + share * det.log(), rotation + share * curl(u, grid, order), mean + share * u
-    boundary = {"boundary_displacement": mean, "start": mean.detach()}
-    return from_jacobian_and_curl(log_det.exp(), rotation, grid, **boundary, order=order, settings=settings)
+    return from_jacobian_and_curl(
+        log_det.exp(),
+        rotation,
+        grid,
+        boundary_displacement=mean,
+        start=mean.detach(),
+        order=order,
+        settings=settings,
+    )
 
 
 def _shares(displacements: Sequence[Tensor], weights: Sequence[float] | None) -> list[float]:

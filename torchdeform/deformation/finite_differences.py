@@ -1,4 +1,4 @@
-"""Least squares on finite differences: rows like the divergence and the curl of a field that is 0 on the boundary.
+"""Least squares on finite differences: rows like the divergence and the curl of a field, 0 where the boundary gives it.
 
 The rows are Σ C_ka ∂_a v_k and the components of curl v at all nodes, by the kernels of `derivatives`, one-sided at the
 boundary. With C = I the first is the divergence, with the cofactors of ∇φ the linearised determinant. Their squares are
@@ -23,8 +23,10 @@ from torchdeform.core.derivatives import (
     map_jacobian,
 )
 from torchdeform.core.grid import Grid
+from torchdeform.core.resampling import AVERAGE_POOL
+from torchdeform.fem.boundary import FIXES
 from torchdeform.solvers.cg import dots
-from torchdeform.solvers.sine_cosine import Kind, separable_transform
+from torchdeform.solvers.sine_cosine import Kind, Kinds, separable_transform
 
 
 @dataclass(frozen=True)
@@ -34,10 +36,12 @@ class Differences:
     Args:
         grid: the grid.
         order: 2 or 4.
+        boundary: which components are given on the boundary: ``dirichlet``, all; ``slip``, those that lead out.
     """
 
     grid: Grid
     order: int
+    boundary: str = "dirichlet"
 
     def rows(self, v: Tensor, factors: Tensor | None = None) -> Tensor:
         """Return (Σ C_ka ∂_a v_k, curl v) at the nodes.
@@ -70,7 +74,7 @@ class Differences:
         return [slope(b, a) - slope(a, b) for a, b in CURL_PAIRS[self.grid.dim]]
 
     def adjoint(self, rows: Tensor, factors: Tensor | None = None) -> Tensor:
-        """Return the transpose of `rows` with the weights of the nodes, 0 on the boundary: Aᵀ W rows.
+        """Return the transpose of `rows` with the weights of the nodes, 0 where the boundary gives v: Aᵀ W rows.
 
         Args:
             rows: ``(B, 1 + curls, *S)``.
@@ -83,7 +87,7 @@ class Differences:
         total = rows.new_zeros(rows.shape[0], self.grid.dim, *self.grid.shape)
         for a in range(self.grid.dim):
             add_adjoint_derivative(total, self._along(a, rows, factors), self.grid, a, order=self.order)
-        return clear_boundary(total, self.grid)
+        return clear_boundary(total, self.grid, self.boundary)
 
     def _along(self, axis: int, rows: Tensor, factors: Tensor | None) -> Tensor:
         """Return what the rows say about ∂_axis of each component, ``(B, D, *S)``."""
@@ -110,38 +114,96 @@ class Differences:
         return dots(rows, self._weighted(rows)).sqrt()
 
     def preconditioner(self, like: Tensor) -> Callable[[Tensor], Tensor]:
-        """Return the inverse of Aᵀ W A, nearly, for C = I and fields like ``like (B, D, *S)`` by sine transforms.
+        """Return the inverse of Aᵀ W A, nearly, for C = I and fields like ``like (B, D, *S)`` by fast transforms.
 
-        For fields that vanish on the boundary differences along different axes commute, up to the nodes next to it, so
-        div and curl together give Σ_a ∂_aᵀ ∂_a for each component. Of sin(π j i/(n − 1)) the kernel of ∂_a makes
+        Differences along different axes commute, up to the nodes next to the boundary. So for fields that vanish there,
+        or whose normal component does, div and curl together give Σ_a ∂_aᵀ ∂_a for each component: sines along the
+        axes where it is given, cosines along those where it is free. Of sin(π j i/(n − 1)) the kernel of ∂_a makes
         s_j cos(π j i/(n − 1)), and Σ_a s² is the eigenvalue. It is as small for waves from node to node as for the
         longest ones: nothing but the boundary holds those either, and elements, which see them, are no substitute.
         """
-        squares, scale = [], 1.0
-        for a, n in enumerate(self.grid.shape):
-            symbol = _symbol(self.grid, a, self.order, like)
-            squares.append(symbol.square().view([n if b == a else 1 for b in range(self.grid.dim)]))
-            scale *= 2 / (n - 1)  # twice the sine sums of unit length give this back
-        inverse = scale / sum(squares[1:], start=squares[0])
-        sines: tuple[Kind, ...] = tuple("sine" for _ in self.grid.shape)
-        kinds = (sines,) * self.grid.dim
+        fixes = FIXES[self.boundary]
+        dim = self.grid.dim
+        kinds: Kinds = tuple(tuple("sine" if fixes(k, a) else "cosine" for a in range(dim)) for k in range(dim))
+        inverse = torch.stack([self._inverse_squares(along, like) for along in kinds])
         return lambda r: separable_transform(separable_transform(r, kinds) * inverse, kinds)
 
+    def _inverse_squares(self, kinds: tuple[Kind, ...], like: Tensor) -> Tensor:
+        """Return 1/Σ_a s² over the squared lengths of the modes of one component, ``(*S)``."""
+        total, length = like.new_zeros(self.grid.shape), like.new_ones(self.grid.shape)
+        for a, (kind, n) in enumerate(zip(kinds, self.grid.shape, strict=True)):
+            shape = [n if b == a else 1 for b in range(self.grid.dim)]
+            squares = like.new_full((n,), (n - 1) / 2)
+            if kind == "cosine":
+                squares[[0, -1]] = n - 1
+            total += _symbol(self.grid, a, self.order, kind, like).square().view(shape)
+            length *= squares.view(shape)
+        return 1 / (total * length)
 
-def _symbol(grid: Grid, axis: int, order: int, like: Tensor) -> Tensor:
-    """Return s_j of the inner kernel, ``(n,)``; 1 at both ends, where sines vanish."""
+
+def _symbol(grid: Grid, axis: int, order: int, kind: Kind, like: Tensor) -> Tensor:
+    """Return s_j of the inner kernel, ``(n,)``; at both ends 0 for cosines, and 1 for sines, which vanish there."""
     interior, n = KERNELS[order][0], grid.shape[axis]
     theta = torch.arange(n, dtype=torch.float64, device="cpu") * (math.pi / (n - 1))
     half = len(interior) // 2
     symbol = sum((2 * interior[half + k] * torch.sin(k * theta) for k in range(1, half + 1)), torch.zeros_like(theta))
     symbol = symbol / grid.spacing[axis]
-    symbol[[0, -1]] = 1.0
+    symbol[[0, -1]] = 1.0 if kind == "sine" else 0.0
     return symbol.to(like)
 
 
-def clear_boundary(field: Tensor, grid: Grid) -> Tensor:
-    """Set ``field (B, C, *S)`` to 0 on the boundary, in place, and return it."""
-    for axis in grid.axes:
-        field.select(axis, 0).zero_()
-        field.select(axis, -1).zero_()
+def clear_boundary(field: Tensor, grid: Grid, boundary: str = "dirichlet") -> Tensor:
+    """Set a field ``(B, D, *S)`` to 0 in place where the boundary gives it, and return it."""
+    for (k, axis), end in product(product(range(field.shape[1]), range(grid.dim)), (0, -1)):
+        if FIXES[boundary](k, axis):
+            field[:, k].select(axis + 1, end).zero_()
     return field
+
+
+def continued(field: Tensor, known: Tensor) -> Tensor:
+    """Return a field with numbers where it is not known, smooth ones next to where it is.
+
+    Args:
+        field: ``(B, C, *S)``, anything where it is not known.
+        known: ``(B, C, *S)`` of bool; a channel without a known node becomes 0.
+
+    Returns:
+        ``(B, C, *S)``: layer by layer the mean of the parabolas through three known nodes in a row along an axis, as
+        many layers as there are axes, so that the edges of the box follow its faces; beyond, the mean of the known
+        neighbours. No number lies beyond the known ones by more than half of their range.
+    """
+    field, dims = field.masked_fill(~known, 0), tuple(range(2, field.dim()))
+    low = field.masked_fill(~known, math.inf).amin(dims, keepdim=True)
+    high = field.masked_fill(~known, -math.inf).amax(dims, keepdim=True)
+    low, high = low - (high - low) / 2, high + (high - low) / 2
+    layers = 0
+    while True:
+        value, weight = _parabolas(field, known) if layers < len(dims) else _neighbours(field, known)
+        new = (weight > 0) & ~known
+        if not bool(new.any()) and layers >= len(dims):
+            return field
+        value = torch.minimum(torch.maximum(value / weight.clamp(min=1e-6), low), high)
+        field, known, layers = torch.where(new, value, field), known | new, layers + 1
+
+
+def _parabolas(field: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the sum of 3 a − 3 b + c over the directions in which the next three nodes are known, and their number."""
+    total, number = torch.zeros_like(field), torch.zeros_like(field)
+    for axis in range(2, field.dim()):
+        count = field.shape[axis] - 3
+        for to, first, step in ((0, 1, 1), (3, 2, -1)):
+            if count < 1:
+                continue
+            places = [first + k * step for k in range(3)]
+            a, b, c = (field.narrow(axis, place, count) for place in places)
+            p, q, r = (known.narrow(axis, place, count) for place in places)
+            there = p & q & r
+            total.narrow(axis, to, count).add_((3 * a - 3 * b + c) * there)
+            number.narrow(axis, to, count).add_(there)
+    return total, number
+
+
+def _neighbours(field: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mean over the known neighbours times their share, and the share."""
+    pool = AVERAGE_POOL[field.dim() - 2]
+    return pool(field * known, 3, stride=1, padding=1), pool(known.to(field.dtype), 3, stride=1, padding=1)

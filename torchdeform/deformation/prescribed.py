@@ -1,7 +1,7 @@
 """A map from its Jacobian determinant and its curl, by the Gauss-Newton method."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -12,7 +12,7 @@ from torchdeform.core.derivatives import CURL_PAIRS, KERNELS, cofactors, jacobia
 from torchdeform.core.diagnostics import smallest_determinant
 from torchdeform.core.fold_free import largest_share
 from torchdeform.core.grid import Grid, common_batch, per_item
-from torchdeform.deformation.finite_differences import Differences
+from torchdeform.deformation.finite_differences import Differences, continued
 from torchdeform.deformation.monitors import require_positive
 from torchdeform.errors import InputError, require_choice, require_ranges
 from torchdeform.fem.boundary import fixed_unknowns
@@ -29,6 +29,9 @@ _STATIONARY = {torch.float32: 1e-4, torch.float64: 1e-10}
 
 # No step takes a determinant below this share of the smaller one of what it is and what it shall be.
 _LEAST_SHARE = 0.1
+
+# What a map may be held by on the boundary.
+_BOUNDARIES = ("dirichlet", "slip")
 
 # Steps are halved this often at most.
 _HALVINGS = 11
@@ -80,26 +83,33 @@ class PrescribedSolution(Solution):
 
 _DEFAULT = NewtonSettings()
 
+# For the data continued to where they are not given, which as a rule no map has.
+_FIRST = NewtonSettings(rtol=1e-4, max_steps=5)
+
 
 def from_jacobian_and_curl(
     f: Tensor,
     curl: Tensor,
     grid: Grid,
     *,
+    boundary: str = "dirichlet",
     boundary_displacement: Tensor | None = None,
     start: Tensor | None = None,
     order: int = 2,
     settings: NewtonSettings = _DEFAULT,
 ) -> PrescribedSolution:
-    """Return u of the map φ = id + u with det ∇φ = f, curl φ = g in Ω and φ = id (or as given) on its boundary.
+    """Return u of the map φ = id + u with det ∇φ = f and curl φ = g in Ω that keeps its boundary.
 
     Args:
-        f: determinant wanted, ``(B, 1, *S)``, positive.
-        curl: g ``(B, 1, *S)`` in 2D, ``(B, 3, *S)`` in 3D, components as in `stencil.curl`.
+        f: determinant wanted, ``(B, 1, *S)``, positive; NaN where it is not prescribed.
+        curl: g ``(B, 1, *S)`` in 2D, ``(B, 3, *S)`` in 3D, components as in `stencil.curl`; NaN where it is not
+            prescribed.
         grid: the grid.
-        boundary_displacement: u on the boundary, ``(B, D, *S)`` in units of spacing, only its boundary nodes matter; 0
-            by default.
-        start: where to start, ``(B, D, *S)``, only its inner nodes matter; by default 0, or with a
+        boundary: ``dirichlet``: φ = id on the boundary, or as given; ``slip``: n·u = 0, or as given, and φ may glide
+            along it.
+        boundary_displacement: u on the boundary, ``(B, D, *S)`` in units of spacing, only what the boundary gives
+            matters; 0 by default.
+        start: where to start, ``(B, D, *S)``, only what the boundary does not give matters; by default 0, or with a
             ``boundary_displacement`` the field with divergence f − 1 and curl g.
         order: order of the finite differences that f and g are given in, 2 or 4, see `jacobian_determinant`.
         settings: tolerance and steps.
@@ -108,8 +118,8 @@ def from_jacobian_and_curl(
         `PrescribedSolution`.
 
     Raises:
-        InputError: shapes, types, order, f that is not positive and finite, a curl that is not finite, too few nodes
-            for the order.
+        InputError: shapes, types, order, boundary, f that is not positive, infinite numbers, NaN in
+            boundary_displacement or start, an item with neither f nor curl, too few nodes for the order.
 
     Notes:
         Minimises ∫ (det ∇φ − f)² + |curl φ − g|². Each step solves for a div-curl system with the cofactors of ∇φ as
@@ -121,8 +131,10 @@ def from_jacobian_and_curl(
         90°; near that they take many more steps of conjugate gradients, and beyond it the method may end in another
         minimum: give a ``start`` that is near. Differentiable once in f, curl and boundary_displacement, by the
         implicit function theorem, also where the data are inconsistent.
+        What is not prescribed is left out of the sum. Where the rest leaves waves from node to node open, as without
+        the boundary's rows, the answer is the map nearest to the one for f and g continued smoothly to there.
     """
-    problem = _problem(f, curl, grid, boundary_displacement, order)
+    problem = _problem(f, curl, boundary_displacement, Differences(grid, order, boundary))
     with torch.no_grad():
         descent = _Descent(problem, problem.start(start), settings)
         descent.run()
@@ -131,10 +143,11 @@ def from_jacobian_and_curl(
 
 
 class _State(NamedTuple):
-    """A map and how far it is off, one entry per item: u, ∇φ, data − rows, and the norm of that."""
+    """A map and how far it is off, one entry per item: u, ∇φ and its determinant, data − rows, and the norm of that."""
 
     u: Tensor
     matrix: Tensor
+    det: Tensor
     left: Tensor
     norm: Tensor
 
@@ -148,10 +161,11 @@ class _State(NamedTuple):
 
 @dataclass(frozen=True)
 class _Problem:
-    """Checked input with one batch size: ``data`` holds f and g."""
+    """Checked input with one batch size: ``data`` holds f and g, `continued` to where ``known`` is 0 instead of 1."""
 
     differences: Differences
     data: Tensor
+    known: Tensor
     values: Tensor | None
     fixed: Tensor
 
@@ -163,6 +177,11 @@ class _Problem:
         """u with the given values on the boundary."""
         return u.masked_fill(self.fixed, 0) if self.values is None else torch.where(self.fixed, self.values, u)
 
+    def take(self, index: Tensor) -> "_Problem":
+        """Return the problem of some items."""
+        values = None if self.values is None else self.values[index]
+        return replace(self, data=self.data[index], known=self.known[index], values=values)
+
     def start(self, given: Tensor | None) -> Tensor:
         if given is not None:
             self.grid.check_vector(given, "from_jacobian_and_curl: start")
@@ -171,20 +190,30 @@ class _Problem:
             if given.shape[0] not in (1, len(self.data)):
                 raise InputError(f"from_jacobian_and_curl: start has {given.shape[0]} items, the data {len(self.data)}")
             return self.complete(given.detach().to(self.data).expand(len(self.data), -1, *self.grid.shape))
+        plain = self._plain_start()
+        index = (self.known == 0).flatten(1).any(1).nonzero().flatten()
+        if len(index) == 0:
+            return plain
+        part = self.take(index)
+        descent = _Descent(replace(part, known=torch.ones_like(part.known)), plain[index], _FIRST)
+        descent.run()
+        return plain.index_copy(0, index, descent.now.u)
+
+    def _plain_start(self) -> Tensor:
         if self.values is None:
             return self.data.new_zeros(self.data.shape[0], self.grid.dim, *self.grid.shape)
         div, curl = self.data[:, :1] - 1, self.data[:, 1:]
-        return solve_div_curl(div, curl, self.grid, "dirichlet", boundary_values=self.values).value
+        return solve_div_curl(div, curl, self.grid, self.differences.boundary, boundary_values=self.values).value
 
     def look(self, u: Tensor, index: Tensor) -> _State:
         """Return the state of items ``index`` at u."""
         matrix, rows = self.differences.of_map(u)
-        left = self.data[index] - rows
-        return _State(u, matrix, left, self.differences.norm(left))
+        left = (self.data[index] - rows) * self.known[index]
+        return _State(u, matrix, rows[:, :1], left, self.differences.norm(left))
 
     def scale(self) -> Tensor:
         """‖(f − 1, g)‖ of each item."""
-        return self.differences.norm(torch.cat([self.data[:, :1] - 1, self.data[:, 1:]], dim=1))
+        return self.differences.norm(torch.cat([self.data[:, :1] - 1, self.data[:, 1:]], dim=1) * self.known)
 
     def rounding(self, u: Tensor) -> Tensor:
         """What rounding leaves of the residual, roughly: an ε of every number that is differentiated."""
@@ -201,11 +230,13 @@ class _Problem:
         if not (wanted and torch.is_grad_enabled()):
             return u
         matrix, rows = self.differences.of_map(self.complete(u))
-        gradient = self.differences.adjoint(rows - self.data, cofactors(matrix))
-        hessian = _Hessian(self.differences, matrix.detach(), (rows - self.data).detach())
+        residual = (rows - self.data) * self.known
+        gradient = self.differences.adjoint(residual, cofactors(matrix))
+        hessian = _Hessian(self.differences, matrix.detach(), self.known, residual.detach())
         precondition = self.differences.preconditioner(u)
         step = conjugate_gradient(hessian, gradient, preconditioner=precondition, atol=math.inf)
-        return self.complete(u) - step.value
+        # What a gradient says about given values is theirs, and no load that the Hessian could meet.
+        return self.complete(u) - step.value.masked_fill(self.fixed, 0)
 
 
 @dataclass(frozen=True)
@@ -214,6 +245,7 @@ class _Hessian:
 
     differences: Differences
     matrix: Tensor
+    known: Tensor
     residual: Tensor
 
     def __call__(self, v: Tensor) -> Tensor:
@@ -223,26 +255,37 @@ class _Hessian:
         change = (cofactors(self.matrix + slope) - cofactors(self.matrix - slope)) / 2
         determinant = F.pad(self.residual[:, :1], [0, 0] * self.differences.grid.dim + [0, self.residual.shape[1] - 1])
         adjoint = self.differences.adjoint
-        return adjoint(self.differences.rows(v, factors), factors) + adjoint(determinant, change)
+        return adjoint(self.differences.rows(v, factors) * self.known, factors) + adjoint(determinant, change)
 
 
-def _problem(f: Tensor, curl: Tensor, grid: Grid, values: Tensor | None, order: int) -> _Problem:
+def _problem(f: Tensor, curl: Tensor, values: Tensor | None, differences: Differences) -> _Problem:
     """Check the input and give it one batch size."""
-    require_choice(order, KERNELS, "from_jacobian_and_curl: order")
-    require_positive(f, grid, "from_jacobian_and_curl: f")
-    grid.check(curl, "from_jacobian_and_curl: curl", components=len(CURL_PAIRS[grid.dim]))
+    where, grid = "from_jacobian_and_curl", differences.grid
+    require_choice(differences.order, KERNELS, f"{where}: order")
+    require_choice(differences.boundary, _BOUNDARIES, f"{where}: boundary")
+    grid.check_scalar(f, f"{where}: f")
+    require_positive(f.nan_to_num(nan=1.0, posinf=math.inf), grid, f"{where}: f")
+    grid.check(curl, f"{where}: curl", components=len(CURL_PAIRS[grid.dim]))
     given = [f, curl]
     if values is not None:
-        grid.check_vector(values, "from_jacobian_and_curl: boundary_displacement")
+        grid.check_vector(values, f"{where}: boundary_displacement")
         given.append(values)
     if len({(t.dtype, t.device) for t in given}) > 1 or f.dtype not in DEFAULT_RTOL:
-        raise InputError("from_jacobian_and_curl: all must be float32, or all float64, on one device")
-    if not all(bool(t.isfinite().all()) for t in given):
-        raise InputError("from_jacobian_and_curl: curl and boundary_displacement must be finite")
-    batch = common_batch("from_jacobian_and_curl", *given)
-    given = [t.expand(batch, *t.shape[1:]) for t in given]
-    fixed = fixed_unknowns("dirichlet", grid, f.device)
-    return _Problem(Differences(grid, order), torch.cat(given[:2], dim=1), (*given[2:], None)[0], fixed)
+        raise InputError(f"{where}: all must be float32, or all float64, on one device")
+    if bool(curl.isinf().any()) or not all(bool(t.isfinite().all()) for t in given[2:]):
+        raise InputError(f"{where}: curl must be finite, or NaN for not prescribed, and boundary_displacement finite")
+    batch = common_batch(where, *given)
+    f, curl, *given = (t.expand(batch, *t.shape[1:]) for t in given)
+    data = torch.cat([f, curl], dim=1)
+    known = ~data.isnan()
+    if not bool(known.flatten(1).any(1).all()):
+        raise InputError(f"{where}: an item has NaN everywhere in f and curl; prescribe at least one of them")
+    if not bool(known.all()):
+        with torch.no_grad():
+            filled = torch.cat([continued(f.log(), known[:, :1]).exp(), continued(curl, known[:, 1:])], dim=1)
+        data = torch.where(known, data, filled)
+    fixed = fixed_unknowns(differences.boundary, grid, f.device)
+    return _Problem(differences, data, known.to(data.dtype), next(iter(given), None), fixed)
 
 
 def _largest(field: Tensor) -> Tensor:
@@ -259,10 +302,10 @@ class _Descent:
     """The steps, made by all items that are not done. What has become of an item is in ``code``."""
 
     def __init__(self, problem: _Problem, u: Tensor, settings: NewtonSettings) -> None:
-        self.problem, self.settings = problem, settings
+        self.problem, self.differences, self.settings = problem, problem.differences, settings
         self.now = problem.look(u, torch.arange(u.shape[0], device=u.device))
         self.scale = problem.scale().clamp(min=torch.finfo(u.dtype).tiny)
-        self.precondition = problem.differences.preconditioner(u)
+        self.precondition = self.differences.preconditioner(u)
         self.steps = torch.zeros(u.shape[0], dtype=torch.int64, device=u.device)
         self.linear_steps, self.stuck = torch.zeros_like(self.steps), torch.zeros_like(self.steps, dtype=torch.bool)
         self.norms = [self.now.norm]
@@ -289,14 +332,14 @@ class _Descent:
 
     def _direction(self, now: _State, index: Tensor) -> tuple[Tensor, Tensor]:
         """Return the step, and by which share of the residual it would shorten it if all were linear."""
-        rows, adjoint = self.problem.differences.rows, self.problem.differences.adjoint
+        rows, adjoint, known = self.differences.rows, self.differences.adjoint, self.problem.known[index]
         factors = cofactors(now.matrix)
         slope = adjoint(now.left, factors)
         # CG has one tolerance for all items: each is scaled so that it is 1.
         unit = (self._forcing(now, index) * dots(slope, slope).sqrt()).clamp(min=torch.finfo(slope.dtype).tiny)
         unit = per_item(unit, slope)
         solution = conjugate_gradient(
-            lambda v: adjoint(rows(v, factors), factors),
+            lambda v: adjoint(rows(v, factors) * known, factors),
             slope / unit,
             preconditioner=self.precondition,
             rtol=0.0,
@@ -327,11 +370,11 @@ class _Descent:
 
     def _acceptable(self, before: _State, after: _State, promise: Tensor, index: Tensor) -> Tensor:
         """Tell which items keep a little of what was promised for the squared residual, and their orientation."""
-        f = self.problem.data[index, :1]
-        old, new = f - before.left[:, :1], f - after.left[:, :1]
-        least = torch.where(old > 0, _LEAST_SHARE * torch.minimum(old, f), old)
+        f, known = self.problem.data[index, :1], self.problem.known[index, :1] > 0
+        old, wanted = before.det, torch.where(known, f, math.inf)
+        least = torch.where(old > 0, _LEAST_SHARE * torch.minimum(old, wanted), old)
         slack = 4 * torch.finfo(f.dtype).eps - 1e-4 * promise
-        return (after.norm <= (1 + slack) * before.norm) & (new >= least).flatten(1).all(1)
+        return (after.norm <= (1 + slack) * before.norm) & (after.det >= least).flatten(1).all(1)
 
     def solution(self, value: Tensor) -> PrescribedSolution:
         """Return the outcome, with ``value`` for the displacement."""

@@ -116,9 +116,10 @@ def adjoint(form: Form, rows: list[Tensor], grid: Grid) -> Tensor:
 
 def _by_slabs(form: Form, field: Tensor, grid: Grid, rows_of: Callable[[Form, Tensor, Grid], list[Tensor]]) -> Tensor:
     """Return the adjoint of weight · rows_of(form, field), slab by slab along the first axis."""
-    layers, out = grid.shape[0] - 1, None
+    elements, out = [n - 1 for n in grid.shape], None
+    layers = elements[0]
     # Whatever the batch, the slabs are the same, and so are the sums over them.
-    layer = math.prod(n - 1 for n in grid.shape[1:])
+    layer = math.prod(elements[1:])
     thickness = max(1, (_SLAB if field.device.type == "cpu" else _LARGE_SLAB) // layer)
     for start in range(0, layers, thickness):
         size = min(thickness, layers - start)

@@ -7,7 +7,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from torchdeform.core.grid import Grid
+from torchdeform.core.grid import Grid, common_batch
+from torchdeform.core.tables import in_transformation
 from torchdeform.errors import InputError
 
 Weight = float | Tensor
@@ -46,6 +47,17 @@ class Weights:
 
     def check(self, grid: Grid) -> None:
         """Raise `InputError` unless shapes fit the elements of ``grid`` and every value is in range."""
+        self.check_shapes(grid)
+        for name, value in self._items():
+            if isinstance(value, Tensor):
+                _require_range(name, *_extremes(value))
+        common_batch("Weights", *self.tensors)
+        held = self.curl + self.strain
+        if isinstance(held, Tensor):
+            _require_held(float(held.detach().amin()))
+
+    def check_shapes(self, grid: Grid) -> None:
+        """Raise `InputError` unless shapes fit the elements of ``grid``."""
         for name, value in self._items():
             if not isinstance(value, Tensor):
                 continue
@@ -59,9 +71,6 @@ class Weights:
                 raise InputError(
                     f"Weights: {name} must be a number or have shape (B, 1, {want}), got {tuple(value.shape)}"
                 )
-            _require_range(name, *torch.stack(value.detach().aminmax()).tolist())
-        if self.tensors:
-            _require_held(float(torch.as_tensor(self.curl + self.strain).detach().amin()))
 
     @property
     def constant(self) -> bool:
@@ -125,9 +134,14 @@ class Weights:
         return self.with_tensors(tuple(w.detach() for w in self.tensors))
 
     @property
+    def values(self) -> tuple[Weight, ...]:
+        """All weights, in the order of the fields."""
+        return tuple(w for _, w in self._items())
+
+    @property
     def tensors(self) -> tuple[Tensor, ...]:
         """The weights that are tensors, in the order of the fields."""
-        return tuple(w for _, w in self._items() if isinstance(w, Tensor))
+        return tuple(w for w in self.values if isinstance(w, Tensor))
 
     def with_tensors(self, tensors: tuple[Tensor, ...]) -> "Weights":
         """Return the weights with those that are tensors replaced, in the order of `tensors`."""
@@ -192,6 +206,18 @@ def _share(weight: Weight, parts: int) -> Weight:
         return weight
     flat = weight.detach().flatten(1)
     return flat.kthvalue(1 + flat.shape[1] // parts, dim=1).values.view(-1, *([1] * (weight.dim() - 1)))
+
+
+def _extremes(weight: Tensor) -> list[float]:
+    try:
+        return torch.stack(weight.detach().aminmax()).tolist()
+    except RuntimeError as error:
+        if not in_transformation():
+            raise
+        raise InputError(
+            "Weights: torch.func.vmap cannot run over weights here; give them as one batch (B, 1, *E), or solve by "
+            "nn.DivCurlVelocity"
+        ) from error
 
 
 def _require_held(least: float) -> None:

@@ -32,7 +32,7 @@ def parse_yaml(text: str, name: str) -> Any:
     """Return what a YAML text holds: mappings with texts for keys, lists, texts, numbers, truth values, None.
 
     Args:
-        text: the text. Dates are texts, and merge keys (``<<``) work.
+        text: the text. Dates are texts, as are whole numbers as keys, and merge keys (``<<``) work.
         name: of the file or the setting, for the sentence.
 
     Raises:
@@ -153,6 +153,7 @@ def _mapping(node: Any, made: dict[Any, Any]) -> dict[str, Any]:
     own: dict[str, Any] = {}
     for key, child in node.value:
         name = _MERGE if key.tag == _MERGE else _value(key, made)
+        name = str(name) if type(name) is int else name
         if not isinstance(name, str):
             _refuse(key, f"the key {shown(name)} is no text; write it in quotes")
         if name in own:

@@ -1,6 +1,7 @@
 """Settings from presets, YAML files and ``key=value`` overrides: typed, and no key unknown."""
 
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
@@ -12,9 +13,12 @@ from torchdeform.errors import InputError, nearest_name, require_choice, shown
 from torchdeform.io.gate import read_text
 from torchdeform.io.texts import Lines, parse_yaml, yaml_lines
 from torchdeform.metrics.similarity import MEASURES
-from torchdeform.registration.settings import SHORT_FORMS, RegistrationSettings
+from torchdeform.registration.settings import SHORT_FORMS, TISSUES, RegistrationSettings
 
 _PRESETS = "presets"
+_TISSUES = "tissues"
+_LABEL = re.compile(r"[0-9]{1,18}")
+_TYPE = re.compile(r"\[.+,|^(str|int|float|tuple)$|\[.+\]$")  # in the place of an error, names of a type in a choice
 _DEEPEST = 5  # groups of settings inside one another
 
 
@@ -46,7 +50,7 @@ def load_settings(
     merged: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for where, layer in layers:
-        values = nested(layer)
+        values = nested(layer, where)
         _require_known(RegistrationSettings, values, where)
         _merge(merged, values)
         sources |= dict.fromkeys(_leaves(values), where)
@@ -99,17 +103,22 @@ def read_yaml_lines(path: Path) -> Lines:
     return yaml_lines(read_text(path, "YAML file"), str(path))
 
 
-def nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings by group: ``{"a.b": 1}`` as ``{"a": {"b": 1}}``, and ``solver: cg`` as ``{method: cg}``."""
+def nested(values: Mapping[str, Any], where: str = "settings") -> dict[str, Any]:
+    """Return settings by group: ``{"a.b": 1}`` as ``{"a": {"b": 1}}``, and ``solver: cg`` as ``{method: cg}``.
+
+    Args:
+        values: settings by name.
+        where: what they are from, for messages.
+    """
     tree: dict[str, Any] = {}
     for key, value in values.items():
         if not isinstance(key, str):
-            raise InputError(f"settings: the name of a setting is a text, got {shown(key)}")
+            raise InputError(f"{where}: the name of a setting is a text, got {shown(key)}")
         *parents, name = key.split(".", _DEEPEST)
-        node = {name: value if parents else _whole_group(name, value)}
+        node = {name: _given_value([*parents, name], value)}
         for parent in reversed(parents):
             node = {parent: node}
-        _merge(tree, node)
+        _merge(tree, {_TISSUES: _by_label(node[_TISSUES], where)} if _TISSUES in node else node)
     return tree
 
 
@@ -121,6 +130,35 @@ def merged_settings(*layers: Mapping[str, Any]) -> dict[str, Any]:
     return tree
 
 
+def _given_value(keys: Sequence[str], value: object) -> object:
+    """Return the value of a setting as it is laid over others: a whole group for its short form, prices as one."""
+    if keys == [_TISSUES] and isinstance(value, Mapping):
+        return {label: _frozen(kind) for label, kind in value.items()}
+    if keys[0] == _TISSUES:
+        return _frozen(value) if len(keys) == 2 else value
+    if keys == ["sliding"] and isinstance(value, int | str) and not isinstance(value, bool):
+        return [value]
+    return _whole_group(keys[0], value) if len(keys) == 1 else value
+
+
+def _frozen(value: object) -> object:
+    """Return a mapping that `_merge` puts in the place of another, instead of laying it over that."""
+    return MappingProxyType(dict(value)) if isinstance(value, Mapping) else value
+
+
+def _by_label(tissues: object, where: str) -> dict[int, object]:
+    """Return kinds or prices of tissue by their labels as numbers, which are texts in YAML and after a dot."""
+    if not isinstance(tissues, Mapping):
+        raise InputError(f"{where}: tissues gives each label its kind, such as {{1: rigid}}, got {shown(tissues)}")
+    for key, kind in tissues.items():
+        if isinstance(key, bool) or not _LABEL.fullmatch(str(key)):
+            raise InputError(f"{where}: tissues: {shown(key)} is no label, which is a whole number from 1")
+        if not isinstance(kind, str | Mapping):
+            names = ", ".join(TISSUES)
+            raise InputError(f"{where}: tissues: label {key} is one of {names}, or prices, got {shown(kind)}")
+    return {int(key): kind for key, kind in tissues.items()}
+
+
 def _whole_group(name: str, value: object) -> object:
     """Return the mapping that the short form of a group stands for; weights of measures are one, too."""
     if name not in SHORT_FORMS:
@@ -129,11 +167,11 @@ def _whole_group(name: str, value: object) -> object:
         return {SHORT_FORMS[name]: value}
     known = {field.name for field in fields(get_type_hints(RegistrationSettings)[name])}
     weights = name == "similarity" and not known & value.keys() and (not value or MEASURES.keys() & value.keys())
-    return {SHORT_FORMS[name]: MappingProxyType(dict(value))} if weights else value
+    return {SHORT_FORMS[name]: _frozen(value)} if weights else value
 
 
 def _merge(base: dict[str, Any], change: Mapping[str, Any]) -> None:
-    """Lay ``change`` over ``base``, mapping by mapping; weights of measures given as a whole replace others."""
+    """Lay ``change`` over ``base``, mapping by mapping; weights and prices given as a whole replace others."""
     for key, value in change.items():
         if isinstance(value, dict) and isinstance(base.get(key), Mapping):
             base[key] = dict(base[key])
@@ -193,11 +231,14 @@ def _validate(values: dict[str, Any], sources: Mapping[str, str]) -> Registratio
     try:
         return TypeAdapter(RegistrationSettings).validate_python(values)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
+        errors = error.errors(include_url=False)
+    # Of a choice of types, the one that goes farthest is meant.
+    first = max((one for one in errors if one["loc"][:2] == errors[0]["loc"][:2]), key=lambda one: len(one["loc"]))
     problem = first["msg"].removeprefix("Value error, ")
     if not first["loc"]:
-        raise InputError(f"settings: {problem}")
-    name = ".".join(map(str, first["loc"]))
+        named = re.match(r"\w*", problem)
+        raise InputError(f"{sources.get(named[0] if named else '', 'settings')}: {problem}")
+    name = ".".join(str(part) for part in first["loc"] if not _TYPE.search(str(part)))
     inside = [known for known in sources if known.startswith(f"{name}.") and known.rpartition(".")[2] in problem]
     where = next((sources[known] for known in (*inside, name, name.partition(".")[0]) if known in sources), "settings")
     own = first["type"] == "value_error" and isinstance(first["input"], dict)  # of a whole group, with names in it

@@ -22,6 +22,8 @@ _PER_NODE = {2: 100.0, 3: 80.0}
 _DISCRETE = {2: (130.0, 75.0), 3: (100.0, 65.0)}
 # And of an assembled matrix while it is made: per entry.
 _PER_ENTRY = 90
+# And of the map of each label that glides: as a share of the first map.
+_PER_SIDE = 0.65
 # And of reading, joining, judging and writing on the fixed grid, however coarse the finest level is.
 _FILES = {2: (65.0, 48.0), 3: (80.0, 26.0)}
 
@@ -44,7 +46,7 @@ def footprint(grid: Grid, channels: int, settings: RegistrationSettings) -> int:
         within 25 % from 64³ to 256³ and from 512² to 4096², and rather more than is taken beyond.
     """
     measures, discrete, symmetric = choices(settings)
-    maps = 2 if symmetric else 1
+    maps = (2 if symmetric else 1) + _PER_SIDE * len(set(settings.sliding))
     per_channel = sum(measure.memory[grid.dim - 2] for measure in measures.values())
     rates = [(maps * _PER_NODE[grid.dim], maps * per_channel), *([_DISCRETE[grid.dim]] if discrete else [])]
     return max(_affine(grid, channels, rate) for rate in rates) + _matrix(grid, settings)

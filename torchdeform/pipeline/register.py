@@ -26,6 +26,7 @@ from torchdeform.metrics.evaluation import common_labels
 from torchdeform.pipeline.annotations import check_annotations
 from torchdeform.pipeline.memory import advice, fitting_grid, footprint
 from torchdeform.pipeline.preflight import WARNING, Finding, Report, preflight
+from torchdeform.pipeline.tissue import check_tissue, contradiction
 from torchdeform.registration.deformable import resample_result
 from torchdeform.registration.problem import Annotations
 from torchdeform.registration.result import Callback, RegistrationResult
@@ -63,6 +64,8 @@ class PairFiles:
         moving_points: the same landmarks in the moving image.
         fixed_labels: regions of the fixed image, whole numbers.
         moving_labels: the same regions of the moving image.
+        tissue: labels of tissue, whole numbers, of the fixed image alone: the settings ``tissues`` and ``sliding`` say
+            what they are.
     """
 
     fixed: Path
@@ -74,6 +77,7 @@ class PairFiles:
     moving_points: Path | None = None
     fixed_labels: Path | None = None
     moving_labels: Path | None = None
+    tissue: Path | None = None
 
     def given(self) -> dict[str, Path]:
         """Return the files that are given, and the folder ``out``, by their names here."""
@@ -134,10 +138,12 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
         memory: bytes that a coarser grid keeps the registration to, see `preflight`.
 
     Raises:
-        InputError: a file cannot be read, `preflight` finds an error, or landmarks or labels do not belong to
-            their image.
+        InputError: a file cannot be read, `preflight` finds an error, landmarks or labels do not belong to their image,
+            or the settings of tissue do not go with its labels.
     """
     files.require_pairs()
+    if problem := contradiction(files.tissue is not None, settings):
+        raise InputError(problem)
     fixed, moving = read_image(files.fixed), read_image(files.moving)
     masks = [read_optional(path) for path in (files.fixed_mask, files.moving_mask)]
     report = preflight(
@@ -151,16 +157,18 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
     )
     report.require_ok()
     require_storable(settings.outside, ending_like(files.moving, moving), moving)
-    labels = [None if path is None else read_labels(path) for path in (files.fixed_labels, files.moving_labels)]
+    paths = (files.fixed_labels, files.moving_labels, files.tissue)
+    labels = [None if path is None else read_labels(path) for path in paths]
     annotations = Annotations(
         fixed_mask=masks[0],
         moving_mask=masks[1],
         fixed_labels=labels[0],
         moving_labels=labels[1],
+        tissue=labels[2],
         **_read_points(files, fixed, moving),
     )
     annotations.require_images(fixed.grid.dim)
-    found = Report.made_of(*_check_annotations(files, (fixed, moving), annotations))
+    found = Report.made_of(*_check_annotations(files, (fixed, moving), annotations, settings))
     found.require_ok()
     if labels[0] is not None and labels[1] is not None:  # some must be the same, or nothing can be measured
         first = resample(labels[0], fixed, mode="nearest")
@@ -169,12 +177,16 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
     return Inputs(fixed, moving, annotations, (*report.of(WARNING), *found.of(WARNING), *remarks))
 
 
-def _check_annotations(files: PairFiles, images: tuple[Image, Image], annotations: Annotations) -> Iterator[Finding]:
-    """Yield what looks wrong with the landmarks and the labels of both images."""
+def _check_annotations(
+    files: PairFiles, images: tuple[Image, Image], annotations: Annotations, settings: RegistrationSettings
+) -> Iterator[Finding]:
+    """Yield what looks wrong with the landmarks and the labels of both images, and with the tissue of the fixed one."""
     for side, image in zip((FIXED, MOVING), images, strict=True):
         points, labels = (getattr(annotations, f"{side}_{what}") for what in ("points", "labels"))
         positions = None if points is None else points[0].T
         yield from check_annotations(image, positions, getattr(files, f"{side}_points"), labels)
+    if isinstance(annotations.tissue, Image):
+        yield from check_tissue(images[0], annotations.tissue, settings)
 
 
 def _read_points(files: PairFiles, fixed: Image, moving: Image) -> dict[str, Tensor]:

@@ -34,6 +34,7 @@ from torchdeform.registration.problem import (
 )
 from torchdeform.registration.result import Callback, LevelRecord, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.sliding import optimise_sides
 from torchdeform.registration.symmetric import (
     MidSpace,
     common_axes,
@@ -41,6 +42,7 @@ from torchdeform.registration.symmetric import (
     midspace_of_tensors,
     optimise_symmetric,
 )
+from torchdeform.registration.tissue import Tissue, TissueOutcome
 
 
 @torch.no_grad()
@@ -107,6 +109,7 @@ def _register_tensors(
     problem = problem_of_tensors(fixed, moving, grid, annotations)
     require_finite(problem.fixed, problem.moving, "register")
     settings = settings.decided()  # items of a batch may not choose for each other
+    problem = replace(problem, tissue=_tissue(annotations.tissue, settings, fixed))
     problem, regions = let_go(problem.scaled(settings), settings)
     space = midspace_of_tensors(problem) if settings.symmetric else None
     found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
@@ -117,6 +120,26 @@ def _register_tensors(
     absent = moved_with(regions, found.u, grid)
     result = replace(_result(found, grid, warped, settings), evaluation=evaluation, absent=absent)
     return _examined(result, compared, (fixed, moving), annotations.labels)
+
+
+def _on(labels: Tensor | Image | None, fixed: Image) -> Tensor | None:
+    return resample(labels, fixed, mode="nearest").round() if isinstance(labels, Image) else None
+
+
+def _tissue(labels: Tensor | Image | None, settings: RegistrationSettings, like: Tensor) -> Tissue | None:
+    """Return what the fixed image is made of; None where nothing is said.
+
+    Raises:
+        InputError: labels without settings that say what they stand for, or the other way round, or ``symmetric``.
+    """
+    if (labels is None) == settings.knows_tissue:
+        missing = "annotations.tissue" if labels is None else "the settings tissues or sliding"
+        raise InputError(f"register: tissue needs both labels and what they stand for, but {missing} is not given")
+    if not isinstance(labels, Tensor):
+        return None
+    if settings.symmetric:
+        raise InputError("register: symmetric and tissue exclude each other, as tissue is that of the fixed image")
+    return Tissue.of(labels, settings, like)
 
 
 def _examined(
@@ -161,7 +184,8 @@ def _register_images(
     annotations.require_images(fixed.grid.dim)
     placed = affine if isinstance(affine, Placement) else place(fixed, moving, settings, annotations, affine)
     both, settings, affine = placed_images(fixed, moving, annotations), placed.settings, placed.affine
-    problem, regions = let_go(problem_at(*both, affine).scaled(settings), settings)
+    problem = replace(problem_at(*both, affine), tissue=_tissue(_on(annotations.tissue, fixed), settings, fixed.data))
+    problem, regions = let_go(problem.scaled(settings), settings)
     space = _midspace(*both, problem, affine, settings) if settings.symmetric else None
     found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
     del problem, space
@@ -214,6 +238,7 @@ class _Optimised:
     objective: tuple[Tensor, ...]
     marks: tuple[Tensor, ...]
     seconds: float
+    tissue: tuple[TissueOutcome, ...]
 
 
 def _optimise(
@@ -236,15 +261,21 @@ def _optimise(
             start = repair_folds(held_still(start, problem.held), problem.grid)
     if space is not None:
         u, records = optimise_symmetric(space, problem.grid, settings, start, callback)
+    elif settings.sliding:
+        u, records = optimise_sides(problem, settings, start, callback)
     else:
         u, records = optimise_levels(problem, settings, start, callback)
+    kept: tuple[TissueOutcome, ...] = ()
     with limit_threads(len(u), problem.grid):
+        if problem.tissue is not None:
+            u, kept = problem.tissue.corrected(u, problem.grid, settings.folds.min_determinant)
+            u = repair_folds(u, problem.grid)
         objective = forward_objective(problem, problem.grid, settings)
         zero = torch.zeros_like(u)
         u, after, before = best_map(objective, settings, u, *([] if start is None else [start]), zero)
         values = before, after
         marks = values if settings.similarity.measure == "lncc" else _marks(problem, settings, zero, u)
-    return _Optimised(u, records, values, marks, perf_counter() - began)
+    return _Optimised(u, records, values, marks, perf_counter() - began, kept)
 
 
 def _marks(problem: RegistrationProblem, settings: RegistrationSettings, *maps: Tensor) -> tuple[Tensor, ...]:
@@ -288,6 +319,7 @@ def _result(found: _Optimised, grid: Grid, warped: Tensor, settings: Registratio
             levels=found.records,
             seconds={"register": found.seconds, "invert": inverted - start, "diagnose": perf_counter() - inverted},
             settings=settings,
+            tissue=found.tissue,
         )
 
 

@@ -16,6 +16,7 @@ from torchdeform.core.fold_free import largest_share, repair_folds, smooth_elast
 from torchdeform.core.grid import Grid, limit_threads, per_item
 from torchdeform.core.resampling import Transfer, coarsened, prolong, pyramid_grids
 from torchdeform.core.warp import compose, warp
+from torchdeform.deformation.rigid import RigidHold
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity, weighted
 from torchdeform.metrics.similarity import features, make_similarity
@@ -23,6 +24,7 @@ from torchdeform.registration.landmarks import ForwardLandmarks, Landmarks
 from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.result import Callback, LevelRecord, Progress
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.tissue import Tissue
 from torchdeform.registration.velocity import (
     LAST_STEP,
     VelocityMetric,
@@ -56,6 +58,14 @@ class Coupling:
     def all(self, flags: Tensor) -> Tensor:
         """Return for each map whether all that move together are flagged, ``(B,)``."""
         return flags
+
+    def extended(self, u: Tensor) -> Tensor:
+        """Return the displacements ``(B, D, *S)`` after what a step leaves to be done where they do not count."""
+        return u
+
+    def together(self, sizes: Tensor) -> Tensor:
+        """Return for each map the largest size ``(B,)`` of those that are scaled together."""
+        return sizes
 
 
 _FREE = Coupling()
@@ -149,6 +159,8 @@ class Level:
         transfer: between the grid of the images and that of the map, None where they are one.
         keep_best: end at the best map that was met, and stop where nothing is gained; otherwise make all steps.
         held: axes along which nothing is moved, from 0.
+        tissue: what the fixed image is made of, on the grid of the map.
+        hold: makes maps rigid again where the tissue is.
     """
 
     objective: Objective
@@ -160,6 +172,8 @@ class Level:
     transfer: Transfer | None = None
     keep_best: bool = True
     held: tuple[int, ...] = ()
+    tissue: Tissue | None = None
+    hold: RigidHold | None = None
 
     @property
     def grid(self) -> Grid:
@@ -195,6 +209,7 @@ class State:
         values: similarity of each map after each step ``(B,)``.
         best_values: what was maximised at its best so far, after each step.
         shortened: steps that were shortened because they would have folded, summed over the batch.
+        ascent: of the last step, as the solver left it, where tissue varies.
     """
 
     u: Tensor
@@ -205,6 +220,7 @@ class State:
     values: tuple[Tensor, ...] = ()
     best_values: tuple[Tensor, ...] = ()
     shortened: int = 0
+    ascent: Tensor | None = None
 
 
 def forward_objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
@@ -254,15 +270,18 @@ def make_level(
 ) -> Level:
     """Return level ``index`` of so many, from the problem on its grid."""
     grid, below = _map_grid(problem.grid, settings), levels - 1 - index
+    tissue = problem.tissue and problem.tissue.on(problem.grid, grid)
     return Level(
         objective=objective(problem, grid, settings),
-        metric=VelocityMetric.of(grid, settings.metric, settings.solver, problem.fixed, below),
+        metric=VelocityMetric.of(grid, settings.metric, settings.solver, problem.fixed, below, tissue),
         settings=settings,
         steps=steps_on(problem.grid, settings.optimiser.steps[index - levels], settings),
         index=index,
         levels=levels,
         transfer=Transfer(problem.grid, grid, problem.fixed) if grid != problem.grid else None,
         held=problem.held,
+        tissue=tissue,
+        hold=None if tissue is None else tissue.hold(grid),
     )
 
 
@@ -343,10 +362,12 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     # 3. Least squares: div and curl of the velocity are paid for, nearly folded places ask for divergence.
     barrier = fold_barrier(state.lowest, settings.folds.soft_determinant)
     force, load = held_still(force, level.held), None if load is None else held_still(load, level.held)
-    v = held_still(level.metric.ascent(force, barrier, load), level.held)
-    v = normalise_step(objective.coupling.velocity(v), grid)
+    coupling = objective.coupling
+    ascent = level.metric.ascent(force, barrier, load, coupling.together, state.ascent)
+    v = held_still(ascent, level.held)
+    v = normalise_step(coupling.velocity(v), grid, coupling.together)
     direction = v + settings.optimiser.momentum * state.direction
-    v = normalise_step(direction, grid)
+    v = normalise_step(direction, grid, coupling.together)
     # 4. and 5. Flow and guard: φ ← φ ∘ flow(v), no farther than where a determinant becomes too small.
     size = v.new_full((len(v),), step_size(settings.optimiser, step, level.steps))
     if points is not None:
@@ -354,7 +375,8 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     moved, u, lowest = fold_free_step(level, state, v * per_item(size * state.active, v))
     shortened = state.shortened + int((moved < 1).sum())
     active = state.active & (moved > 0)
-    return replace(state, u=u, lowest=lowest, direction=direction, active=active, shortened=shortened), False
+    state = replace(state, u=u, lowest=lowest, direction=direction, active=active, shortened=shortened)
+    return replace(state, ascent=None if level.tissue is None else ascent), False
 
 
 def held_still(field: Tensor, axes: Sequence[int]) -> Tensor:
@@ -376,12 +398,17 @@ def fold_free_step(level: Level, state: State, v: Tensor) -> tuple[Tensor, Tenso
     settings, grid = level.settings, level.grid
     floor = state.lowest.flatten(1).amin(1).clamp(max=settings.folds.min_determinant)
     u, lowest = state.u, state.lowest
+    free = None if level.tissue is None else level.tissue.free
 
     def accept(share: Tensor) -> Tensor:
         nonlocal u, lowest
         u = compose(state.u, flow(v * per_item(share, v), grid, settings.flow), grid)
         if settings.metric.elasticity > 0:
-            u = smooth_elastically(u, settings.metric.elasticity * share * state.active, grid)
+            moved = per_item(settings.metric.elasticity * share * state.active, u)
+            u = smooth_elastically(u, moved if free is None else moved * free, grid)
+        u = level.objective.coupling.extended(u)
+        if level.hold is not None:
+            u = level.hold(u, floor)
         lowest = one_sided_determinant(u, grid)
         return level.objective.coupling.all(lowest.flatten(1).amin(1) >= floor)
 

@@ -17,6 +17,9 @@ from torchdeform.registration.affine.align import Alignment, align
 from torchdeform.registration.problem import Annotations, PlacedImage, RegistrationProblem, placed_images, resample_pair
 from torchdeform.registration.settings import RegistrationSettings
 
+# Kinds of tissue that only a rigid alignment leaves as they are, and the alignments that it then takes the place of.
+_KEPT, _CHANGING = {"rigid", "incompressible"}, ("similarity", "affine")
+
 # An alignment is taken where it raises the merit by more than this.
 _GAIN = 1e-4
 
@@ -66,7 +69,9 @@ def place(
         The alignment is not taken where the files' own place has as much merit: `mark` times the share of the fixed
         image's contrast that is seen, at full detail, in the measure of the registration. Merit counts what the moving
         image does not show as unrelated, so that both places are judged over the same voxels.
+        Where tissue is to keep its shape or its volume, ``similarity`` and ``affine`` become ``rigid``.
     """
+    settings = _keeping_tissue(settings)
     both, alignment = placed_images(fixed, moving, annotations), None
     if affine is None and settings.align.kind != "none":
         alignment = _align(fixed, moving, settings, annotations)
@@ -80,6 +85,14 @@ def place(
         kept = replace(alignment, affine=Affine.identity(fixed.grid.dim), start="geometry")
         alignment = replace(kept, similarity_after=alignment.similarity_before)
     return Placement(settings, alignment.affine, alignment, unaligned, choice)
+
+
+def _keeping_tissue(settings: RegistrationSettings) -> RegistrationSettings:
+    """Return the settings with a rigid alignment where another would change tissue that is to be kept."""
+    kinds = {kind for kind in settings.tissues.values() if isinstance(kind, str)}
+    if not kinds & _KEPT or settings.align.kind not in _CHANGING:
+        return settings
+    return replace(settings, align=replace(settings.align, kind="rigid"))
 
 
 def _align(fixed: Image, moving: Image, settings: RegistrationSettings, annotations: Annotations) -> Alignment:

@@ -18,6 +18,7 @@ from torchdeform.metrics.base import weighted
 from torchdeform.metrics.correlation import lncc
 from torchdeform.metrics.similarity import needs_common_scale
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.tissue import Tissue
 
 # Slices are far apart where they are so many times farther than the nodes and the pixels.
 _SPARSE = 3.0
@@ -119,6 +120,7 @@ class RegistrationProblem:
         fixed_points: ``(B, D, n)`` in grid points, or None.
         moving_points: likewise.
         held: axes along which nothing is moved, from 0.
+        tissue: what the fixed image is made of, None where nothing is said.
     """
 
     grid: Grid
@@ -129,6 +131,7 @@ class RegistrationProblem:
     fixed_points: Tensor | None = None
     moving_points: Tensor | None = None
     held: tuple[int, ...] = ()
+    tissue: Tissue | None = None
 
     @property
     def pairs(self) -> tuple[Tensor, Tensor] | None:
@@ -150,7 +153,8 @@ class RegistrationProblem:
 
         masks = {name: coarser(getattr(self, name)) for name in ("fixed_mask", "moving_mask")}
         images = {"fixed": restrict(self.fixed, self.grid, coarse), "moving": restrict(self.moving, self.grid, coarse)}
-        return replace(self, grid=coarse, **images, **masks)
+        tissue = self.tissue and self.tissue.on(self.grid, coarse)
+        return replace(self, grid=coarse, tissue=tissue, **images, **masks)
 
     def scaled(self, settings: RegistrationSettings) -> "RegistrationProblem":
         """Return the problem with intensities on the scale that the similarity needs."""

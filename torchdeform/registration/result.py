@@ -135,4 +135,5 @@ class RegistrationResult:
             mirror=self.alignment.mirror if self.alignment else 0.0,
             warnings=self.warnings,
             unit=self.unit,
+            tissue=self.tissue,
         )

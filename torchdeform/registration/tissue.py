@@ -1,8 +1,20 @@
 """What the tissue of the fixed image costs to deform, and how well it was kept."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import product
 
+import torch
 from torch import Tensor
+
+from torchdeform.core.grid import Grid
+from torchdeform.core.resampling import restrict
+from torchdeform.deformation.incompressible import hold_volume
+from torchdeform.deformation.rigid import RigidHold
+from torchdeform.deformation.tissue import label_fit
+from torchdeform.errors import InputError
+from torchdeform.fem.weights import Weights
+from torchdeform.registration.settings import TISSUES, RegistrationSettings
 
 
 @dataclass(frozen=True)
@@ -39,3 +51,112 @@ class TissueOutcome:
     nodes: Tensor
     before: TissueFit
     after: TissueFit
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """The labels that the settings name, on one grid.
+
+    Attributes:
+        labels: their numbers.
+        shares: how much of each node they have ``(B or 1, L, *S)``, from 0 to 1.
+        prices: what each costs, by name; what is not there costs what it costs elsewhere.
+        kinds: what each is called.
+        sliding: whether the border of each glides.
+    """
+
+    labels: tuple[int, ...]
+    shares: Tensor
+    prices: tuple[Mapping[str, float], ...]
+    kinds: tuple[str, ...]
+    sliding: tuple[bool, ...]
+
+    @classmethod
+    def of(cls, labels: Tensor, settings: RegistrationSettings, like: Tensor) -> "Tissue":
+        """Return the tissue of an image of labels ``(B or 1, 1, *S)``.
+
+        Args:
+            labels: whole numbers.
+            settings: what they stand for.
+            like: a tensor with the type of the shares.
+
+        Raises:
+            InputError: a label that the settings name and no item has.
+        """
+        numbers = tuple(sorted({*settings.tissues, *settings.sliding}))
+        shares = torch.cat([labels == number for number in numbers], dim=1).to(like)
+        for number, found in zip(numbers, shares.amax(dim=(0, *range(2, shares.dim()))).tolist(), strict=True):
+            if not found:
+                raise InputError(f"tissue: no voxel has the label {number} that the settings name; name others")
+        named = [settings.tissues.get(number, "free") for number in numbers]
+        return cls(
+            numbers,
+            shares,
+            tuple(TISSUES[one] if isinstance(one, str) else one for one in named),
+            tuple(one if isinstance(one, str) else "own" for one in named),
+            tuple(number in settings.sliding for number in numbers),
+        )
+
+    def on(self, grid: Grid, coarse: Grid) -> "Tissue":
+        """Return the same on a coarser grid of the same box."""
+        return self if grid == coarse else replace(self, shares=restrict(self.shares, grid, coarse))
+
+    def masks(self, kind: str) -> Tensor:
+        """Return the nodes of the labels of a kind ``(B or 1, L', *S)``, bool; each node in one label at most."""
+        return self.shares[:, [k for k, one in enumerate(self.kinds) if one == kind]] > 0.5
+
+    def corrected(self, u: Tensor, grid: Grid, floor: float) -> tuple[Tensor, tuple[TissueOutcome, ...]]:
+        """Return maps ``(B, D, *S)`` that keep shapes and volumes as asked for, and how well before and after that."""
+        found = [(self._fits(u, grid))]
+        if (hold := self.hold(grid)) is not None:
+            u = hold(u, floor)
+        u = hold_volume(u, self.masks("incompressible"), grid, still=self.masks("rigid"))
+        found.append(self._fits(u, grid))
+        nodes = (self.shares > 0.5).flatten(2).sum(2).expand(len(u), -1)
+        named = zip(self.labels, self.kinds, self.sliding, nodes.unbind(1), *found, strict=True)
+        return u, tuple(TissueOutcome(*one) for one in named)
+
+    def _fits(self, u: Tensor, grid: Grid) -> list[TissueFit]:
+        return [TissueFit(*label_fit(u, label, grid)) for label in (self.shares > 0.5).split(1, dim=1)]
+
+    def hold(self, grid: Grid) -> RigidHold | None:
+        """Return what keeps the rigid labels rigid, None where there are none."""
+        masks = self.masks("rigid")
+        return RigidHold(masks, grid) if bool(masks.any()) else None
+
+    def weights(self, base: Weights) -> Weights:
+        """Return what a velocity costs in each element, ``base`` where there is no label."""
+        if not any(self.prices):
+            return base
+        share = _means_of_corners(self.shares)
+        parts = {}
+        for name in ("div", "curl", "strain"):
+            usual = getattr(base, name)
+            more = [price.get(name, usual) - usual for price in self.prices]
+            weight = usual + (share * share.new_tensor(more).view(1, -1, *[1] * (share.dim() - 2))).sum(1, keepdim=True)
+            parts[name] = weight
+        return Weights(zero=base.zero, **parts)
+
+    @property
+    def gliding(self) -> Tensor:
+        """The shares of the labels whose borders glide ``(B or 1, L', *S)``."""
+        return self.shares[:, [k for k, slides in enumerate(self.sliding) if slides]]
+
+    @property
+    def free(self) -> Tensor:
+        """The share of each node ``(B or 1, 1, *S)`` that no price holds."""
+        held = [k for k, price in enumerate(self.prices) if price]
+        return 1 - self.shares[:, held].sum(1, keepdim=True).clamp(max=1)
+
+
+def _corners(field: Tensor) -> list[Tensor]:
+    """Return the values ``(B, C, *E)`` at each corner of every element of a field ``(B, C, *S)``."""
+    return [
+        field[(..., *(slice(1, None) if side else slice(-1) for side in corner))]
+        for corner in product((0, 1), repeat=field.dim() - 2)
+    ]
+
+
+def _means_of_corners(field: Tensor) -> Tensor:
+    corners = _corners(field)
+    return sum(corners[1:], start=corners[0]) / len(corners)

@@ -1,6 +1,7 @@
 """From a force to a velocity: the least-squares metric of a level, and how far its flow goes in one step."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,13 +12,21 @@ from torchdeform.fem.solver import SolverSettings, solver_of
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
 from torchdeform.registration.settings import MetricSettings, OptimiserSettings
+from torchdeform.registration.tissue import Tissue
 from torchdeform.solvers.base import Factor
 
 # The step falls to this share of itself over a level.
 LAST_STEP = 0.1
 
+# To this share of the load the least squares are solved where tissue varies.
+_RTOL = 1e-2
+
 # Weight of the divergence that opens up nearly folded places, against a force of 1 at its strongest.
 _BARRIER_WEIGHT = 3.0
+
+
+def _alone(sizes: Tensor) -> Tensor:
+    return sizes
 
 
 @dataclass(frozen=True)
@@ -26,20 +35,33 @@ class VelocityMetric:
 
     Attributes:
         factor: the solver made ready for K on the grid of the map.
+        system: its loads, with the weights of what no tissue is named for.
         order: power of the metric, see `Factor`.
     """
 
     factor: Factor
+    system: DivCurlSystem
     order: int = 1
 
     @classmethod
     def of(
-        cls, grid: Grid, settings: MetricSettings, solver: SolverSettings, like: Tensor, below: int = 0
+        cls,
+        grid: Grid,
+        settings: MetricSettings,
+        solver: SolverSettings,
+        like: Tensor,
+        below: int = 0,
+        tissue: Tissue | None = None,
     ) -> "VelocityMetric":
-        """Return the metric of a level's grid that has so many finer levels below it."""
+        """Return the metric of a level's grid that has so many finer levels below it, dearer where tissue says so."""
         length = settings.length_at(below) * grid.cell_volume ** (1 / grid.dim)
         weights = Weights(settings.weight_div, settings.weight_curl, settings.weight_div / length**2)
-        return cls.of_weights(grid, weights, solver, like, settings.order)
+        if tissue is None:
+            return cls.of_weights(grid, weights, solver, like, settings.order)
+        if solver.rtol is None:  # a direction is wanted, not a solution
+            solver = replace(solver, rtol=_RTOL)
+        system = DivCurlSystem(grid, tissue.weights(weights), "slip")
+        return cls(solver_of(solver, system).init(system, like), replace(system, weights=weights), settings.order)
 
     @classmethod
     def of_weights(
@@ -47,39 +69,49 @@ class VelocityMetric:
     ) -> "VelocityMetric":
         """Return the metric with these weights; nothing flows out of the box."""
         system = DivCurlSystem(grid, weights, "slip")
-        return cls(solver_of(solver, system).init(system, like), order)
-
-    @property
-    def system(self) -> DivCurlSystem:
-        """K and its loads."""
-        return self.factor.system
+        return cls(solver_of(solver, system).init(system, like), system, order)
 
     @property
     def grid(self) -> Grid:
         """The grid of velocities."""
         return self.system.grid
 
-    def velocity(self, force: Tensor, div: Tensor | None = None) -> Tensor:
-        """Return v with K v = load of a force density ``(B, D, *S)`` and of a divergence ``(B, 1, *S)``."""
-        return self.factor(self.system.load(div=div, force=force), power=self.order)
+    def velocity(self, force: Tensor, div: Tensor | None = None, near: Tensor | None = None) -> Tensor:
+        """Return v with K v = load of a force density ``(B, D, *S)`` and of a divergence ``(B, 1, *S)``.
 
-    def ascent(self, force: Tensor, barrier: Tensor | None = None, points: Tensor | None = None) -> Tensor:
+        Where tissue varies it is found from a velocity that is ``near``, to a share of the load.
+        """
+        load = self.system.load(div=div, force=force)
+        if near is None or self.order > 1:
+            return self.factor(load, power=self.order)
+        return self.factor.solution(load, near).value
+
+    def ascent(
+        self,
+        force: Tensor,
+        barrier: Tensor | None = None,
+        points: Tensor | None = None,
+        together: Callable[[Tensor], Tensor] = _alone,
+        near: Tensor | None = None,
+    ) -> Tensor:
         """Return the velocity of steepest ascent, of any length.
 
         Args:
             force: force density of the images ``(B, D, *S)``, in any unit; it is scaled to 1 at its strongest.
             barrier: divergence asked for ``(B, 1, *S)`` where the map is nearly folded, see `fold_barrier`.
             points: load of the landmarks ``(B, D, *S)``, in the unit of the force.
+            near: a velocity to begin with, see `velocity`.
+            together: of sizes ``(B,)``, the largest of those that are scaled together.
 
         Notes:
             The load of points is smoothed by one power more, w_0 (M⁻¹K)⁻¹, which keeps its sum: what least squares
             alone answer to a point, a logarithm in 2D and 1/r in 3D, has a peak there.
         """
         strongest = max_norm(force) if points is None else max_norm(force).maximum(max_norm(points))
-        scale = 1 / strongest.clamp(min=torch.finfo(force.dtype).tiny)
+        scale = 1 / together(strongest).clamp(min=torch.finfo(force.dtype).tiny)
         weights = self.system.weights
         div = None if barrier is None else barrier * (_BARRIER_WEIGHT / weights.div)
-        v = self.velocity(force * per_item(scale, force), div)
+        v = self.velocity(force * per_item(scale, force), div, near)
         if points is not None:
             load = points * per_item(scale * (self.grid.cell_volume * weights.zero), points)
             v = v + self.factor(load, power=self.order + 1)
@@ -97,9 +129,9 @@ def fold_barrier(lowest: Tensor, soft_determinant: float) -> Tensor:
     return (soft_determinant / lowest - 1).clamp_(min=0)
 
 
-def normalise_step(v: Tensor, grid: Grid) -> Tensor:
+def normalise_step(v: Tensor, grid: Grid, together: Callable[[Tensor], Tensor] = _alone) -> Tensor:
     """Return the velocity ``(B, D, *S)`` on the scale on which its longest move is one voxel; 0 stays 0."""
-    longest = max_norm(v / grid.along(grid.spacing, v))
+    longest = together(max_norm(v / grid.along(grid.spacing, v)))
     return v / per_item(longest.clamp(min=torch.finfo(v.dtype).tiny), v)
 
 

@@ -10,6 +10,7 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.image import UNITS
 from torchdeform.metrics.evaluation import Evaluation
 from torchdeform.registration.evidence import Evidence
+from torchdeform.registration.tissue import TissueOutcome
 
 GOOD, LOOK, BAD = "good", "look", "bad"
 _ORDER = (BAD, LOOK, GOOD)
@@ -28,6 +29,7 @@ _SIGNS = 3  # so many of the four signs that images do not belong together are e
 
 _LOST, _SPOILT = 0.05, 0.2  # loss of correlation or information by the deformation: look, bad
 _INVERSE = 0.5  # voxels
+_BENT, _SQUEEZED = 0.5, 0.05  # voxels off a rigid motion, and of the determinant off 1, in tissue that is to keep them
 _ABSENT = 0.05
 _STRUCTURE = 0.27  # (two contrasts of one thing 0.32; unrelated pictures 0.13, another organ 0.23)
 _MIRROR, _MIRRORED = 1.1, 1.2  # merit of a mirrored alignment over the best one: look, bad (good pairs 1.05)
@@ -89,6 +91,7 @@ def judge(
     mirror: float = 0.0,
     warnings: Sequence[str] = (),
     unit: str = "px",
+    tissue: Sequence[TissueOutcome] = (),
 ) -> Verdict:
     """Return the verdict on one pair.
 
@@ -100,6 +103,7 @@ def judge(
         mirror: merit of the best mirrored alignment over that of the best one, 0 if unknown.
         warnings: sentences about what looks wrong with the input.
         unit: what lengths are shown in, one of `UNITS`.
+        tissue: how labels of tissue were kept, of one item.
 
     Notes:
         No figure proves that the right tissue is on the right tissue. Only labels, landmarks or a look can show it.
@@ -109,7 +113,7 @@ def judge(
     if evaluation is not None and _proven(evaluation) and all(some.kind == GOOD for some in known):
         found = [replace_bad(some) if some.kind == BAD and folds == 0 else some for some in found]
     others = [text for text in warnings if mirror <= _MIRROR or "mirror image" not in text]
-    found += [*known, *(Finding(LOOK, f"{WARNED}{text}.") for text in others)]
+    found += [*known, *_tissue(tissue), *(Finding(LOOK, f"{WARNED}{text}.") for text in others)]
     found.sort(key=lambda some: _ORDER.index(some.kind))
     kind = found[0].kind
     return Verdict(kind, _HEADLINES[kind].format(_reason(found[0].text)), tuple(found))
@@ -204,6 +208,22 @@ def _map(evidence: Evidence) -> Iterator[Finding]:
     if not e.inverse_error < _INVERSE:
         text = f"The map and its inverse do not take points back ({number(e.inverse_error)} voxels off at 1 % of them)."
         yield Finding(LOOK, text, {"inverse_error": e.inverse_error})
+
+
+def _tissue(outcomes: Sequence[TissueOutcome]) -> Iterator[Finding]:
+    """Tissue that is not what it was to be."""
+    for one in outcomes:
+        residual, off = one.after.residual.item(), one.after.off.item()
+        if one.kind == "rigid" and residual > _BENT:
+            text = (
+                f"The tissue of label {one.label} did not stay rigid (up to {number(residual)} voxels off its motion)."
+            )
+            yield Finding(LOOK, text, {"label": one.label, "residual": residual})
+        if one.kind == "incompressible" and off > _SQUEEZED:
+            text = (
+                f"The tissue of label {one.label} did not keep its volume (the determinant is up to {off:.0%} off 1)."
+            )
+            yield Finding(LOOK, text, {"label": one.label, "off": off})
 
 
 def _annotations(evaluation: Evaluation | None, evidence: Evidence, grid: Grid, unit: str) -> Iterator[Finding]:

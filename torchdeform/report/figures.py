@@ -31,7 +31,7 @@ from torchdeform.report.drawing import (
     tinted,
     volume_scale,
 )
-from torchdeform.report.marks import ABSENT, LANDMARKS, NO_DATA, OUTLINES, REGIONS
+from torchdeform.report.marks import ABSENT, LANDMARKS, NO_DATA, OUTLINES, REGIONS, TISSUE
 from torchdeform.report.planes import WORDS, Plane, planes_of
 from torchdeform.report.report_data import ReportData, Slices
 from torchdeform.report.sampling import FIXED, MOVING, WARPED, grey, to_unit
@@ -125,7 +125,7 @@ def _headlines(data: ReportData, most: int) -> tuple[str, str]:
 
 def _draw_image(name: str, axes: "Axes", data: ReportData, cuts: Slices) -> "AxesImage":
     shown = draw_image(axes, cuts.plane, cuts.fields[name][cuts.middle])
-    _draw_marks(axes, cuts, name, (OUTLINES, LANDMARKS, NO_DATA, ABSENT))
+    _draw_marks(axes, cuts, name, (OUTLINES, TISSUE, LANDMARKS, NO_DATA, ABSENT))
     return shown
 
 
@@ -150,7 +150,9 @@ def _draw_grid(axes: "Axes", data: ReportData, cuts: Slices) -> "AxesImage":
 
 
 def _draw_volume(axes: "Axes", data: ReportData, cuts: Slices) -> "AxesImage":
-    return draw_map(axes, cuts.plane, cuts.fields["log_det"][cuts.middle], volume_scale(data.limits["log_det"]))
+    shown = draw_map(axes, cuts.plane, cuts.fields["log_det"][cuts.middle], volume_scale(data.limits["log_det"]))
+    _draw_marks(axes, cuts, FIXED, (TISSUE,))
+    return shown
 
 
 _VOLUME = "volume"

@@ -15,6 +15,8 @@ from torchdeform.report.marks import (
     MOVING_COLOUR,
     NO_DATA,
     OUTLINES,
+    TISSUE,
+    TISSUE_COLOUR,
     WORST,
     WORST_COLOUR,
 )
@@ -47,6 +49,7 @@ def legend(data: ReportData) -> list[Entry]:
         entries.append(Entry(LANDMARKS, "landmarks", bar=bar, note=about))
     entries += [
         _lines(MASKS, "masks", others),
+        Entry(TISSUE, "tissue", [(TISSUE_COLOUR, "")], note="labels that the settings tissues and sliding name"),
         Entry(NO_DATA, "no data", [(EMPTY_COLOUR, "")], note="beyond the moving image"),
         Entry(ABSENT, "in the fixed image only", [(ABSENT_COLOUR, "")], note=_ABOUT_ABSENT),
         Entry(WORST, "worst place", [(WORST_COLOUR, "")], note=known.worst.reason),

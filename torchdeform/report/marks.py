@@ -13,11 +13,12 @@ from torchdeform.report.places import Place, slice_of
 from torchdeform.report.planes import Plane
 from torchdeform.report.sampling import FIXED, WARPED, Sampled
 
-OUTLINES, MASKS, LANDMARKS, NO_DATA, ABSENT, WORST = "outlines", "masks", "landmarks", "no-data", "absent", "worst"
+OUTLINES, MASKS, TISSUE, LANDMARKS = "outlines", "masks", "tissue", "landmarks"
+NO_DATA, ABSENT, WORST = "no-data", "absent", "worst"
 REGIONS = (NO_DATA, ABSENT)
-# Sky blue, orange, reddish purple and yellow of Okabe and Ito, distinct with any colour blindness.
-FIXED_COLOUR, MOVING_COLOUR, ABSENT_COLOUR, WORST_COLOUR, EMPTY_COLOUR = (
-    "#56b4e9", "#e69f00", "#cc79a7", "#f0e442", "#888888",
+# Sky blue, orange, reddish purple, yellow and bluish green of Okabe and Ito, distinct with any colour blindness.
+FIXED_COLOUR, MOVING_COLOUR, ABSENT_COLOUR, WORST_COLOUR, TISSUE_COLOUR, EMPTY_COLOUR = (
+    "#56b4e9", "#e69f00", "#cc79a7", "#f0e442", "#009e73", "#888888",
 )  # fmt: skip
 LANDMARK_COLOURS = "plasma"
 _CLASSES = 6  # colours of landmarks
@@ -85,11 +86,13 @@ def marks_of(plane: Plane, numbers: Sequence[int], sampled: Mapping[str, Sampled
 
 
 def _of_image(plane: Plane, name: str, image: Sampled) -> Marks:
-    """Return the ends of an image, its mask, and its labels or the edges of the fixed image."""
+    """Return the ends of an image, its mask and tissue, and its labels or the edges of the fixed image."""
     colour = FIXED_COLOUR if name == FIXED else MOVING_COLOUR
     found: Marks = {Mark(NO_DATA, name, EMPTY_COLOUR): _regions(~image.inside)}
     if image.mask is not None:
         found[Mark(MASKS, name, colour)] = _regions(image.mask != 0)
+    if image.tissue is not None:
+        found[Mark(TISSUE, name, TISSUE_COLOUR)] = tuple(outlines(_flat(image.tissue)))
     if image.labels is not None:
         found[Mark(OUTLINES, name, colour)] = tuple(outlines(_flat(image.labels)))
     elif name == FIXED:

@@ -23,7 +23,7 @@ from torchdeform.report.drawing import (
     volume_scale,
 )
 from torchdeform.report.legend import legend
-from torchdeform.report.marks import ABSENT, NO_DATA, REGIONS, WORST, Mark
+from torchdeform.report.marks import ABSENT, NO_DATA, REGIONS, TISSUE, WORST, Mark
 from torchdeform.report.planes import SIDES, WORDS
 from torchdeform.report.record import describe
 from torchdeform.report.report_data import ReportData, Slices
@@ -223,7 +223,7 @@ class _Renderer:
         limits, dim = self._data.limits, self._data.result.grid.dim
         yield Picture(GRID, "Deformed grid", _CAPTIONS[GRID], lines=self._over(FIXED, GRID))
         size, scale = WORDS[dim]["volume"].capitalize(), volume_scale(limits["log_det"])
-        yield self._map("log_det", f"{size}: moving / fixed", scale, self._over(FIXED, ABSENT))
+        yield self._map("log_det", f"{size}: moving / fixed", scale, self._over(FIXED, ABSENT, TISSUE))
         yield self._map("divergence", "Divergence", signed_scale(limits["divergence"]))
         yield self._map(
             "rotation", "Curl" if dim == 2 else "Length of the curl", rotation_scale(limits["rotation"], dim)

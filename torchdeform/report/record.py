@@ -18,6 +18,7 @@ from torchdeform.core.interpolation import LABEL_MODE
 from torchdeform.metrics.evaluation import Evaluation, Measures
 from torchdeform.registration.result import LevelRecord, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.tissue import TissueOutcome
 
 
 def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[str, Any]:
@@ -50,6 +51,7 @@ def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[st
         "seconds": result.seconds,
         "alignment": _alignment(result),
         "evaluation": _evaluation(result.evaluation, fixed),
+        "tissue": [_tissue(outcome) for outcome in result.tissue],
         "label_interpolation": result.evaluation and result.evaluation.label_interpolation,
         "verdict": asdict(result.verdict),
         "evidence": asdict(result.evidence[0]),
@@ -120,6 +122,18 @@ def _measures(measures: Measures, fixed: Image) -> dict[str, object]:
         found["landmark_error_max"] = errors.max().item()
         found["landmark_errors"] = errors.tolist()
     return found
+
+
+def _tissue(outcome: TissueOutcome) -> dict[str, object]:
+    """Return how one label was kept: residuals in voxels, the others as shares."""
+    fits = {stage: getattr(outcome, stage) for stage in ("before", "after")}
+    return {
+        "label": outcome.label,
+        "kind": outcome.kind,
+        "sliding": outcome.sliding,
+        "nodes": int(outcome.nodes.item()),
+        **{stage: {name: value.item() for name, value in vars(fit).items()} for stage, fit in fits.items()},
+    }
 
 
 def _level(level: LevelRecord) -> dict[str, object]:

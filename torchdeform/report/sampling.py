@@ -1,4 +1,4 @@
-"""Values of both images, of their labels and of their masks at the points of slices, and how they become grey."""
+"""Values of both images, of their labels, masks and tissue at the points of slices, and how they become grey."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +12,7 @@ from torchdeform.core.transform import Affine
 from torchdeform.core.warp import inside_box, sample
 from torchdeform.registration.problem import Annotations
 from torchdeform.registration.result import RegistrationResult
+from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.planes import Plane
 
 FIXED, WARPED, MOVING, ORIGINAL = "fixed", "warped", "moving", "original"
@@ -28,6 +29,7 @@ class Sampled:
         inside: where the image has values, bool.
         labels: 0 outside; None without.
         mask: bool; None without.
+        tissue: labels of tissue that the settings name, 0 elsewhere; None without.
     """
 
     colours: Tensor
@@ -35,6 +37,7 @@ class Sampled:
     inside: Tensor
     labels: Tensor | None = None
     mask: Tensor | None = None
+    tissue: Tensor | None = None
 
 
 class PairSampler:
@@ -46,7 +49,8 @@ class PairSampler:
         self.stages = (WARPED, MOVING) if result.affine is None else (WARPED, MOVING, ORIGINAL)
         warped = replace(moving, data=result.warped.detach().cpu().float(), grid=fixed.grid)
         self._on_grid = {FIXED: _with_grey(fixed), WARPED: _with_grey(warped)}
-        self._fixed = _Side(fixed, annotations.fixed_labels, annotations.fixed_mask)
+        tissue = _named(annotations.tissue, result.settings)
+        self._fixed = _Side(fixed, annotations.fixed_labels, annotations.fixed_mask, tissue)
         self._moving = _Side(moving, annotations.moving_labels, annotations.moving_mask)
 
     def at(self, image: str, points: Tensor, chosen: Callable[[Tensor], Tensor]) -> Sampled:
@@ -71,6 +75,14 @@ class PairSampler:
         return replace(found, **parts)
 
 
+def _named(tissue: object, settings: RegistrationSettings) -> Image | None:
+    """Return the labels of tissue that the settings name, 0 elsewhere; None without."""
+    if not isinstance(tissue, Image):
+        return None
+    names = torch.tensor([*settings.tissues, *settings.sliding], device=tissue.data.device)
+    return replace(tissue, data=tissue.data * torch.isin(tissue.data, names.to(tissue.data)))
+
+
 def _with_grey(image: Image) -> Tensor:
     """Return the colours of an image and their grey values as channels, of a grey image only these."""
     values = grey(image)
@@ -91,10 +103,10 @@ class _Nodes:
 
 
 class _Side:
-    """One image with its labels and its mask."""
+    """One image with its labels, its mask and its tissue."""
 
-    def __init__(self, image: Image, labels: object, mask: object) -> None:
-        self._image, self._labels, self._mask = image, labels, mask
+    def __init__(self, image: Image, labels: object, mask: object, tissue: object = None) -> None:
+        self._image, self._labels, self._mask, self._tissue = image, labels, mask, tissue
         self._data = _with_grey(image)
         self._empty = surroundings(replace(image, data=self._data))
         self._colours, self._grey = ends(image.data), ends(self._data[:, -1:])
@@ -108,11 +120,11 @@ class _Side:
             values = values.where(inside, self._empty.view(1, -1, *[1] * self._image.grid.dim))
         greys = _between(values[:, -1:], *self._grey)
         colours = _between(values[:, :3], *self._colours) if values.shape[1] > 1 else greys
-        parts = (self._labels if labels else None, self._mask if mask else None)
+        parts = (self._labels if labels else None, self._mask if mask else None, self._tissue)
         return Sampled(colours, greys, inside, *(self._nearest(part, nodes, place, inside) for part in parts))
 
     def _nearest(self, part: object, nodes: _Nodes, place: Tensor, inside: Tensor) -> Tensor | None:
-        """Return labels or a mask at the nodes, 0 outside."""
+        """Return labels, a mask or tissue at the nodes, 0 outside."""
         if not isinstance(part, Image):
             return None
         if not same_place(part, self._image):

@@ -1,7 +1,7 @@
 """The figures of the page: tiles, tables, commands."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -114,8 +114,7 @@ def _words(record: Record) -> Mapping[str, str]:
 
 
 def _voxels(record: Record, key: str) -> str:
-    length, voxel = record[key], _words(record)["voxel"]
-    return f"< 0.001 {voxel}" if 0 <= value(length) < 1e-3 else f"{number(length)} {voxel}"
+    return f"{_length(value(record[key]))} {_words(record)['voxel']}"
 
 
 def _seconds(time: float) -> str:
@@ -123,15 +122,62 @@ def _seconds(time: float) -> str:
 
 
 def tables(record: Record) -> list[Table]:
-    """Return the tables of a record: labels, landmarks, levels, time and memory, files, settings and versions."""
-    found = [_labels(record), _landmarks(record), _levels(record), _costs(record), _images(record), _settings(record)]
-    return [table for table in found if table is not None]
+    """Return the tables of a record: tissue, labels, landmarks, levels, time and memory, files, settings, versions."""
+    found = (_tissue, _labels, _landmarks, _levels, _costs, _images, _settings)
+    return [table for make in found if (table := make(record)) is not None]
 
 
 def _measures(record: Record, key: str) -> dict[str, Mapping[str, Any]]:
     """Return the measures of labels and landmarks by stage, of the stages that have the key."""
     found = record.get("evaluation", {})
     return {stage: found[stage] for stage in _STAGES if key in found.get(stage, {})}
+
+
+def _tissue(record: Record) -> Table | None:
+    """Return how the labels of tissue were kept."""
+    rows = [
+        [f"{one['label']}", kind_of(one), f"{one['nodes']:,}", *(text(one, " → ") for text in KEPT.values())]
+        for one in record.get("tissue", ())
+    ]
+    voxel = _words(record)["voxel"]
+    summary = (
+        "Before → after the last correction. Off a rigid motion: the largest distance from the rigid motion that fits "
+        f"best, in {voxel}s. Determinant: how far from 1, so from keeping the size, 99.9 % of the {voxel}s are at most."
+    )
+    head = ["label", "kind", f"{voxel}s", "off a rigid motion", "determinant within", _words(record)["volume"]]
+    return Table("Tissue", [Part(head, rows, words=1)], summary) if rows else None
+
+
+def kind_of(tissue: Mapping[str, Any]) -> str:
+    """Return what a label of tissue is."""
+    kind = "own prices" if tissue["kind"] == "own" else tissue["kind"]
+    return f"{kind}, sliding" if tissue["sliding"] else kind
+
+
+def _stages(one: Mapping[str, Any], key: str, arrow: str, form: Callable[[float], str]) -> str:
+    """Return a figure of a label before and after, or once if it is the same."""
+    texts = [form(value(one[stage][key])) for stage in ("before", "after")]
+    return arrow.join(dict.fromkeys(texts))
+
+
+def _percent(share: float, sign: str = "") -> str:
+    """Return a share in per cent, to a hundredth at most."""
+    if not math.isfinite(share):
+        return "–"
+    percent = round(100 * share, 2)
+    return f"{percent:{sign}.0f} %" if abs(percent) >= 10 else f"{percent:{sign}.2g} %"
+
+
+def _length(voxels: float) -> str:
+    return "< 0.001" if 0 <= voxels < 1e-3 else number(voxels)
+
+
+# What is said of a label, by its key in the record.
+KEPT: dict[str, Callable[[Mapping[str, Any], str], str]] = {
+    "residual": lambda one, arrow: _stages(one, "residual", arrow, _length),
+    "off": lambda one, arrow: _stages(one, "off", arrow, _percent),
+    "volume": lambda one, arrow: _stages(one, "volume", arrow, lambda volume: _percent(volume - 1, "+")),
+}
 
 
 def _labels(record: Record) -> Table | None:
@@ -225,7 +271,7 @@ def _images(record: Record) -> Table:
 
 
 def _settings(record: Record) -> Table:
-    given = [[name, _plain(setting)] for name, setting in record["settings"].items()]
+    given = [[name, _plain(setting) or "–"] for name, setting in record["settings"].items()]
     versions = [[name, str(version)] for name, version in record["versions"].items()]
     parts = [Part(["setting", "value"], given, "All settings", words=1), Part(["version of", ""], versions, words=1)]
     return Table("Settings and versions", parts)

@@ -1,0 +1,181 @@
+"""Borders that glide: each side has a map of its own, and at the border they move alike across it.
+
+A velocity that is smooth on either side and agrees across the border, not along it, has a sheet of curl there and no
+divergence. The loop sees a batch of as many maps as there are sides, each compared on its side alone. Beyond its side a
+map goes on smoothly, and in the end every node takes that of its own side.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchdeform.core.derivatives import derivative
+from torchdeform.core.fold_free import keep_faces, lowest_determinant, neighbour_mean, repair_folds
+from torchdeform.core.grid import Grid
+from torchdeform.metrics.base import Similarity, weighted
+from torchdeform.registration.optimise import Coupling, Objective, forward_objective, optimise_levels
+from torchdeform.registration.problem import RegistrationProblem
+from torchdeform.registration.result import Callback, LevelRecord
+from torchdeform.registration.settings import RegistrationSettings
+
+# How often a border is smoothed to see its direction: some 2 voxels wide.
+_ROUNDS = 4
+
+# How often the values of a side are smoothed to go on beyond it: 2 voxels.
+_BEYOND = 2
+
+# Widths in voxels over which one map passes into the other where a narrower border folds, each so much wider.
+_NARROWEST, _WIDER, _WIDEST, _TRIALS = 1.0, 1.5, 8.0, 30
+
+
+def optimise_sides(
+    problem: RegistrationProblem, settings: RegistrationSettings, start: Tensor | None, callback: Callback | None
+) -> tuple[Tensor, tuple[LevelRecord, ...]]:
+    """Return the displacements ``(B, D, *S)`` of maps that glide along the borders of labels, and how each level went.
+
+    Args:
+        problem: images on their scale, with a tissue of which some labels glide.
+        settings: how.
+        start: displacement ``(B, D, *S)`` to begin with; zero when None.
+        callback: is shown every step.
+    """
+    items, sides = len(problem.fixed), _sides(problem)
+    count = sides.shape[1]
+    shown = None if callback is None else lambda step: callback(replace(step, similarity=step.similarity[:items]))
+    several = _by_sides(problem, sides)
+    begun = None if start is None else start.repeat(count, *[1] * (start.dim() - 1))
+    u, records = optimise_levels(several, settings, begun, shown, _objective)
+    joined = join(u.unflatten(0, (count, items)).transpose(0, 1), sides, problem.grid, settings.folds.min_determinant)
+    return joined, tuple(replace(one, similarity=tuple(v[:items] for v in one.similarity)) for one in records)
+
+
+def _sides(problem: RegistrationProblem) -> Tensor:
+    """Return how much of each node belongs to each side ``(B or 1, K, *S)``: to labels that glide, and to the rest."""
+    own = problem.tissue.gliding
+    return torch.cat([own, 1 - own.sum(1, keepdim=True).clamp(max=1)], dim=1)
+
+
+def _by_sides(problem: RegistrationProblem, sides: Tensor) -> RegistrationProblem:
+    """Return the problem with a pair for each side and item, the items of a side after one another."""
+    items, count = len(problem.fixed), sides.shape[1]
+
+    def repeated(field: Tensor | None) -> Tensor | None:
+        return None if field is None else field.repeat(count, *[1] * (field.dim() - 1))
+
+    names = ("fixed", "moving", "moving_mask", "fixed_points", "moving_points")
+    masks = sides.expand(items, *sides.shape[1:]).transpose(0, 1).flatten(0, 1).unsqueeze(1)
+    shares = problem.tissue.shares
+    tissue = replace(problem.tissue, shares=shares if len(shares) == 1 else repeated(shares))
+    return replace(
+        problem,
+        fixed_mask=weighted(masks, repeated(problem.fixed_mask)),
+        tissue=tissue,
+        **{name: repeated(getattr(problem, name)) for name in names},
+    )
+
+
+def _objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
+    """Return what is maximised where every side has a map: the similarity of all sides, each by its size."""
+    alone = forward_objective(problem, grid, settings)
+    sides = _sides(replace(problem, tissue=problem.tissue.on(problem.grid, grid)))
+    count = sides.shape[1]
+    size = problem.fixed_mask.flatten(1).mean(1)
+    similarity = _OfAllSides(alone.similarity.similarity, size.unflatten(0, (count, -1)))
+    term = replace(alone.similarity, similarity=similarity)
+    return replace(alone, similarity=term, coupling=Gliding(sides, grid))
+
+
+@dataclass(frozen=True)
+class _OfAllSides(Similarity):
+    """The similarity of an item's sides together, weighted by their sizes ``(K, B)``, for each of its maps."""
+
+    alone: Similarity
+    sizes: Tensor
+
+    def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        value, slope = self.alone.evaluate(warped, mask)
+        count = len(self.sizes)
+        shares = self.sizes / self.sizes.sum(0)
+        joint = (value.unflatten(0, (count, -1)) * shares).sum(0)
+        # Of a side the slope is per node of that side.
+        return joint.repeat(count), slope
+
+
+class Gliding(Coupling):
+    """The maps of an item's sides move alike across their common borders.
+
+    Args:
+        sides: how much of each node belongs to each side ``(B or 1, K, *S)``.
+        grid: their grid.
+    """
+
+    def __init__(self, sides: Tensor, grid: Grid) -> None:
+        self.grid, self.count = grid, sides.shape[1]
+        own = (sides > 0.5).to(sides)
+        self.own, self.reach = own.unsqueeze(2), smoothed(own, _BEYOND).unsqueeze(2)
+        self.shares = smoothed(own)
+        slopes = torch.stack([derivative(self.shares, grid, a) for a in range(grid.dim)], dim=2)  # (B, K, D, *S)
+        length = slopes.square().sum(2, keepdim=True).sqrt()
+        self.normals = slopes / length.clamp(min=torch.finfo(sides.dtype).tiny)
+        self.near = (8 * self.shares * (1 - self.shares)).clamp(max=1).unsqueeze(2)
+
+    def velocity(self, v: Tensor) -> Tensor:
+        """Return the velocities ``(K·B, D, *S)`` with one component across borders, the mean by shares."""
+        apart = v.unflatten(0, (self.count, -1)).transpose(0, 1)  # (B, K, D, *S)
+        mean = (apart * self.shares.unsqueeze(2)).sum(1, keepdim=True)
+        across = ((mean - apart) * self.normals).sum(2, keepdim=True)
+        return (apart + self.near * across * self.normals).transpose(0, 1).flatten(0, 1)
+
+    def extended(self, u: Tensor) -> Tensor:
+        """Return the displacements ``(K·B, D, *S)``, each going on beyond its side as it is there.
+
+        What holds a map back beyond its side would else hold back its border.
+        """
+        apart = u.unflatten(0, (self.count, -1)).transpose(0, 1)  # (B, K, D, *S)
+        flat = (apart * self.own).flatten(1, 2)
+        near = smoothed(flat, _BEYOND).unflatten(1, (self.count, -1)) / self.reach.clamp(min=1e-6)
+        beyond = (1 - self.own) * (10 * self.reach).clamp(max=1)
+        return keep_faces(torch.lerp(apart, near, beyond.expand_as(apart)).transpose(0, 1).flatten(0, 1), u, self.grid)
+
+    def all(self, flags: Tensor) -> Tensor:
+        return flags.unflatten(0, (self.count, -1)).all(0).repeat(self.count)
+
+    def together(self, sizes: Tensor) -> Tensor:
+        return sizes.unflatten(0, (self.count, -1)).amax(0).repeat(self.count)
+
+
+def smoothed(field: Tensor, rounds: int = _ROUNDS) -> Tensor:
+    """Return a field smoothed by so many means of neighbours."""
+    for _ in range(rounds):
+        field = neighbour_mean(field)
+    return field
+
+
+def join(apart: Tensor, sides: Tensor, grid: Grid, floor: float) -> Tensor:
+    """Return the displacement that is each side's own on it, passing from one to the other as fast as folds allow.
+
+    Args:
+        apart: displacements of all sides ``(B, K, D, *S)`` in units of spacing, without folds.
+        sides: how much of each node belongs to each side ``(B or 1, K, *S)``.
+        grid: the grid.
+        floor: smallest one-sided determinant that the border may have.
+
+    Returns:
+        ``(B, D, *S)`` without folds.
+    """
+    inside = smoothed((sides > 0.5).to(apart))
+    slope = sum(derivative(inside, grid, a).square() * grid.spacing[a] ** 2 for a in range(grid.dim)).sqrt()
+    distance = (inside - 0.5) / slope.clamp(min=1e-6)  # in voxels, near the border
+    width = torch.full_like(apart[:, :1, 0], _NARROWEST)
+    u = apart[:, 0]
+    for _ in range(_TRIALS):
+        shares = (0.5 + distance / width).clamp(0, 1)
+        shares = shares / shares.sum(1, keepdim=True).clamp(min=1e-6)
+        u = (apart * shares.unsqueeze(2)).sum(1)
+        folded = lowest_determinant(u, grid) <= floor
+        if not bool(folded.any()):
+            break
+        around = smoothed(folded.to(u), 1)
+        width = (width * (1 + (_WIDER - 1) * around)).clamp(max=_WIDEST)
+    return repair_folds(u, grid, floor)
