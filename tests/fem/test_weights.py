@@ -88,3 +88,12 @@ def test_labels_cost_what_they_are_said_to_and_their_border_is_soft():
 def test_labels_that_do_not_fit_are_refused():
     with pytest.raises(InputError, match=r"labels must have shape \(B, 1, 4, 5\), got \(1, 4, 5\)"):
         weights_of_labels(torch.zeros(1, 4, 5), {}, Weights(), GRID)
+
+
+def test_the_base_is_what_the_cheapest_sixteenth_costs_with_strain_as_divergence_and_curl():
+    strain = torch.zeros(1, 1, 4, 8)
+    strain[..., 1:] = 10.0
+    base = Weights(0.5, 1.0, 0.1, strain).base(2)
+    assert (float(base.div), float(base.curl), base.zero, base.strain) == (0.5, 1.0, 0.1, 0.0)
+    even = Weights(0.5, 0.0, 0.1, torch.full((1, 1, 4, 8), 10.0)).base(2)
+    assert (float(even.div), float(even.curl)) == (5.5, 5.0)

@@ -251,3 +251,21 @@ def test_wrong_input_is_refused(change, message):
     arguments = {"b": torch.zeros(2, 3), **change}
     with pytest.raises(InputError, match=message):
         conjugate_gradient(lambda x: x, **arguments)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.5, -3.0])
+def test_a_guess_goes_first_and_is_checked(factor):
+    """One that is right leaves nothing to do, one that is not is mended, and items that are done are not asked for."""
+    diagonal, asked = torch.tensor([1.0, 4.0, 9.0], dtype=torch.float64), []
+
+    def guess(b, tolerance, max_steps):
+        asked.append(b.clone())
+        return factor * b / diagonal, torch.full((len(b),), 2), torch.tensor([factor == 1.0] * len(b))
+
+    b = torch.tensor([[1.0, 2.0, 3.0], [3.0, 1.0, 1.0]], dtype=torch.float64)
+    start = torch.stack([b[0] / diagonal, torch.zeros(3, dtype=torch.float64)])
+    solution = conjugate_gradient(lambda x: x * diagonal, b, x0=start, guess=guess)
+    assert solution.ok
+    torch.testing.assert_close(solution.value, b / diagonal)
+    assert not asked[0][0].any()
+    assert int(solution.steps[1]) == (2 if factor == 1.0 else solution.steps[1])
