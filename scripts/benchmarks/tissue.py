@@ -32,10 +32,13 @@ from tissue_phantoms import Phantom, blocks, bones, lesion
 
 import torchdeform as td
 from torchdeform.deformation.volumes import nodal_volumes
+from torchdeform.fem.solver import solver_of
+from torchdeform.fem.system import DivCurlSystem
 from torchdeform.metrics.correlation import lncc
 
 _LANDMARKS = 200  # in each bone
 SIDES = ("fixed", "moving")
+OTHERS = ("lung", "solver")
 _NEAR = 3.0  # voxels from the interface
 
 Figures = dict[str, float]
@@ -229,10 +232,38 @@ def landmark_figures(found: td.RegistrationResult) -> Figures:
     return {name: float(value) for name, value in (figures | {"folds": found.diagnosis.folds}).items()}
 
 
+def solver(nodes: int = 64, most: int = 1000) -> None:
+    """Print the steps of conjugate gradients where a ball, or half of the box, is 10⁴ times as dear as the rest."""
+    grid = td.Grid((nodes,) * 3)
+    way = grid.points() - (nodes - 1) / 2
+    shapes = {"half": way[:, :1] > 0, "ball": way.norm(dim=1, keepdim=True) < nodes / 4}
+    for (shape, inside), kind in product(shapes.items(), ("div", "div and curl", "rigid")):
+        share = inside[:, :, 1:, 1:, 1:].float()
+        dear = 1 + 9999 * share
+        weights = {
+            "div": td.Weights(0.5 * dear, 1.0, 0.01),
+            "div and curl": td.Weights(0.5 * dear, dear, 0.01),
+            "rigid": td.Weights(0.5 * dear, 1 - share, 0.01, 9999 * share),
+        }[kind]
+        system = DivCurlSystem(grid, weights, "slip")
+        force = torch.randn(1, 3, *grid.shape, generator=torch.Generator().manual_seed(0))
+        settings = td.SolverSettings(method="cg", rtol=1e-6, max_steps=most)
+        start = perf_counter()
+        load = system.load(force=force)
+        found = solver_of(settings, system).init(system, load).solution(load)
+        figures = {
+            "steps": float(found.steps.max()),
+            "state": found.status[0].name,
+            "seconds": perf_counter() - start,
+        }
+        print_row(f"solver, {nodes}³, {shape}", kind, figures, header=(shape, kind) == ("half", "div"))
+    print_row("all", "target", {"steps": "≤ 40", "state": "CONVERGED", "seconds": ""})
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", nargs="?", default=os.environ.get("TORCHDEFORM_DATA", "../shared/data"), type=Path)
-    parser.add_argument("--only", nargs="+", default=[*KINDS, "lung"], choices=[*KINDS, "lung"])
+    parser.add_argument("--only", nargs="+", default=[*KINDS, *OTHERS], choices=[*KINDS, *OTHERS])
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--peers", nargs="*", choices=list(TOOLS), help="those named, or those of each phantom")
     arguments = parser.parse_args()
@@ -240,6 +271,8 @@ def main() -> None:
     for name in arguments.only:
         if name == "lung":
             lung(arguments.data)
+        elif name == "solver":
+            solver()
         else:
             run(KINDS[name], arguments.seed, arguments.peers)
 

@@ -77,7 +77,8 @@ def _seconds(job: Job, size: Size) -> float | None:
     levels = pyramid_grids(grid, len(steps))
     steps = steps[len(steps) - len(levels) :]
     node_steps = sum(math.prod(g.shape) * steps_on(g, n, settings) for g, n in zip(levels, steps, strict=True))
-    fields = (2 if symmetric else 1) * channels * sum(measure.time for measure in measures.values())
+    maps = (2 if symmetric else 1) + len(set(settings.sliding))
+    fields = maps * channels * sum(measure.time for measure in measures.values())
     return _PAIR + fields * _PER_NODE_STEP[grid.dim] * node_steps
 
 

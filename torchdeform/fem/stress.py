@@ -80,7 +80,7 @@ class StressGuess:
     def __call__(self, b: Tensor, tolerance: Tensor, max_steps: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return v, the steps, and which items met the tolerance on their load, as far as rounding lets them."""
         free = self.soft(b)
-        settings = Settings(self._precondition, 0.0, tolerance, max_steps, norm=self._load_norm)
+        settings = Settings(self._precondition, 0.0, tolerance, max_steps, norm=self._load_norm, restart=False)
         found = solve(Operator(self._stiffness), self._stressed(free), None, settings)
         v = free - self.soft(self._force(found.value))
         met = [status in (Status.CONVERGED, Status.ROUNDING) for status in found.status]

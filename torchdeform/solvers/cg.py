@@ -201,7 +201,10 @@ def jacobi(system: System, like: Tensor) -> Callable[[Tensor], Tensor]:
 
 @dataclass(frozen=True)
 class Settings:
-    """As for `conjugate_gradient`; the ``norm`` of a residual, ``(B,)`` from ``(B, ...)``, is its length when None."""
+    """As for `conjugate_gradient`; the ``norm`` of a residual, ``(B,)`` from ``(B, ...)``, is its length when None.
+
+    Without ``restart`` what the recurrence lost is left to who asked.
+    """
 
     preconditioner: Callable[[Tensor], Tensor] | None
     rtol: float
@@ -210,6 +213,7 @@ class Settings:
     watch: bool = False
     guess: Guess | None = None
     norm: Callable[[Tensor], Tensor] | None = None
+    restart: bool = True
 
 
 def _check(b: Tensor, x0: Tensor | None, rtol: float | None, atol: float, max_steps: int) -> None:
@@ -302,20 +306,22 @@ def solve(operator: Operator, b: Tensor, x0: Tensor | None, settings: Settings) 
     r = b.clone() if x0 is None else _residual(operator, b, x, settings)
     before = length(r)
     code = torch.where(before <= tolerance, _MET, _RUNNING)
-    if settings.guess is not None:
-        change, steps, near = settings.guess(
-            torch.where(per_item(code == _MET, r), 0, r), tolerance, settings.max_steps
-        )
-        x = x + change
+    while settings.guess is not None:
+        asked = torch.where(per_item(code == _MET, r), 0, r)
+        change, more, near = settings.guess(asked, tolerance, settings.max_steps)
+        x, steps = x + change, steps + more
         r = _residual(operator, b, x, settings)
-        before = length(r)
-        code = torch.where(near | (before <= tolerance), _MET, _RUNNING)
+        left = length(r)
+        again = near & (left > tolerance) & (left < before / 2)
+        code, before = torch.where((left <= tolerance) | (near & ~again), _MET, _RUNNING), left
+        if not bool(again.any()):
+            break
     while True:
         code = _descend(operator, settings, (x, r), tolerance, code, steps)
         r = _residual(operator, b, x, settings)
         left = length(r)
         missed = (code == _MET) & (left > tolerance)
-        again = missed & (left < before / 2)
+        again = missed & (left < before / 2) & settings.restart
         code = torch.where(missed, torch.where(again, _RUNNING, _ROUNDING), code)
         if not bool((again & (steps < settings.max_steps)).any()):
             break
