@@ -12,6 +12,9 @@ from torchdeform.solvers.cg import ConjugateGradient, jacobi
 # A matrix of more entries (see `DivCurlSystem.matrix_entries`) is not assembled: that would take more than 6 GB.
 LARGEST_MATRIX = 2**26
 
+# Up to so many the matrix is soon assembled, and faster than products without it.
+SMALL_MATRIX = 2**23
+
 METHODS = ("auto", "transform", "stress", "cg", "assembled")
 PRECONDITIONERS = {"transform": FastTransform(approximate=True).init, "jacobi": jacobi, "none": None}
 
@@ -59,8 +62,10 @@ def solver_of(settings: SolverSettings | str, system: DivCurlSystem) -> LinearSo
         raise InputError("solver: stress is for weights of which some are far dearer than others; take auto or cg")
     if how.method == "transform" or (how.method == "auto" and is_exact_for(system)):
         return FastTransform(rtol=how.rtol, atol=how.atol)
+    entries = system.matrix_entries
+    small = how.method == "auto" and entries <= SMALL_MATRIX and all(w.dim() == 0 or len(w) == 1 for w in system.weights.tensors)
     return ConjugateGradient(
-        assembled=how.method == "assembled" and system.matrix_entries <= LARGEST_MATRIX,
+        assembled=small or (how.method == "assembled" and entries <= LARGEST_MATRIX),
         preconditioner=PRECONDITIONERS[how.preconditioner],
         rtol=how.rtol,
         atol=how.atol,

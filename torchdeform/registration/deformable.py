@@ -267,13 +267,13 @@ def _optimise(
         u, records = optimise_levels(problem, settings, start, callback)
     kept: tuple[TissueOutcome, ...] = ()
     with limit_threads(len(u), problem.grid):
-        if problem.tissue is not None:
-            u, kept = problem.tissue.corrected(u, problem.grid, settings.folds.min_determinant)
-            u = repair_folds(u, problem.grid)
         objective = forward_objective(problem, problem.grid, settings)
         zero = torch.zeros_like(u)
         u, after, before = best_map(objective, settings, u, *([] if start is None else [start]), zero)
         values = before, after
+        if problem.tissue is not None:
+            u, kept = problem.tissue.corrected(u, problem.grid, settings.folds.min_determinant)
+            values = tuple(objective.similarity.on_common_voxels([zero, u]))
         marks = values if settings.similarity.measure == "lncc" else _marks(problem, settings, zero, u)
     return _Optimised(u, records, values, marks, perf_counter() - began, kept)
 

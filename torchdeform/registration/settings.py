@@ -17,9 +17,9 @@ STARTS = (AUTO, "identity", "discrete")
 # What the kinds of tissue cost, beside div 0.5, curl 1 and strain 0 of what is not named.
 TISSUES: dict[str, dict[str, float]] = {
     "free": {},
-    "stiff": {"div": 20.0, "strain": 20.0, "curl": 0.0},
-    "rigid": {"div": 1e4, "strain": 1e4, "curl": 0.0},
-    "incompressible": {"div": 1e4},
+    "stiff": {"div": 20.0, "strain": 20.0},
+    "rigid": {"div": 100.0, "strain": 100.0},
+    "incompressible": {"div": 100.0},
 }
 PRICES = ("div", "strain", "curl")
 STENCILS = ("auto", "convolution", "shifts")

@@ -19,7 +19,7 @@ from torchdeform.solvers.base import Factor
 LAST_STEP = 0.1
 
 # To this share of the load the least squares are solved where tissue varies.
-_RTOL = 1e-2
+_RTOL = 0.1
 
 # Weight of the divergence that opens up nearly folded places, against a force of 1 at its strongest.
 _BARRIER_WEIGHT = 3.0
