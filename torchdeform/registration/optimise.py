@@ -63,6 +63,10 @@ class Coupling:
         """Return the displacements ``(B, D, *S)`` after what a step leaves to be done where they do not count."""
         return u
 
+    def counted(self, lowest: Tensor) -> Tensor:
+        """Return the determinants ``(B, 1, *S)`` with 1 where folds do not count."""
+        return lowest
+
     def together(self, sizes: Tensor) -> Tensor:
         """Return for each map the largest size ``(B,)`` of those that are scaled together."""
         return sizes
@@ -409,7 +413,7 @@ def fold_free_step(level: Level, state: State, v: Tensor) -> tuple[Tensor, Tenso
         u = level.objective.coupling.extended(u)
         if level.hold is not None:
             u = level.hold(u, floor)
-        lowest = one_sided_determinant(u, grid)
+        lowest = level.objective.coupling.counted(one_sided_determinant(u, grid))
         return level.objective.coupling.all(lowest.flatten(1).amin(1) >= floor)
 
     share = largest_share(accept, floor, halvings=_HALVINGS)

@@ -26,7 +26,7 @@ _ROUNDS = 4
 _BEYOND = 2
 
 # Widths in voxels over which one map passes into the other where a narrower border folds, each so much wider.
-_NARROWEST, _WIDER, _WIDEST, _TRIALS = 1.0, 1.5, 8.0, 30
+_NARROWEST, _WIDER, _WIDEST, _TRIALS = 1.0, 1.25, 6.0, 16
 
 
 def optimise_sides(
@@ -138,6 +138,10 @@ class Gliding(Coupling):
         beyond = (1 - self.own) * (10 * self.reach).clamp(max=1)
         return keep_faces(torch.lerp(apart, near, beyond.expand_as(apart)).transpose(0, 1).flatten(0, 1), u, self.grid)
 
+    def counted(self, lowest: Tensor) -> Tensor:
+        own = self.own.transpose(0, 1).expand(-1, len(lowest) // self.count, *lowest.shape[1:])
+        return torch.where(own.flatten(0, 1) > 0, lowest, 1)
+
     def all(self, flags: Tensor) -> Tensor:
         return flags.unflatten(0, (self.count, -1)).all(0).repeat(self.count)
 
@@ -176,6 +180,6 @@ def join(apart: Tensor, sides: Tensor, grid: Grid, floor: float) -> Tensor:
         folded = lowest_determinant(u, grid) <= floor
         if not bool(folded.any()):
             break
-        around = smoothed(folded.to(u), 1)
+        around = (2**grid.dim * smoothed(folded.to(u), 1)).clamp(max=1)
         width = (width * (1 + (_WIDER - 1) * around)).clamp(max=_WIDEST)
     return repair_folds(u, grid, floor)
