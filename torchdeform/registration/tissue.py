@@ -7,6 +7,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import restrict
 from torchdeform.deformation.incompressible import hold_volume
@@ -111,6 +112,7 @@ class Tissue:
         if (hold := self.hold(grid)) is not None:
             u = hold(u, floor)
         u = hold_volume(u, self.masks("incompressible"), grid, still=self.masks("rigid"))
+        u = repair_folds(u, grid)  # where two labels that turn leave no room between them
         found.append(self._fits(u, grid))
         nodes = (self.shares > 0.5).flatten(2).sum(2).expand(len(u), -1)
         named = zip(self.labels, self.kinds, self.sliding, nodes.unbind(1), *found, strict=True)
