@@ -317,7 +317,7 @@ def test_tissue_goes_to_the_engine_and_into_summary_and_command(folder, engine, 
     ("prepare", "arguments", "message"),
     [
         (None, [*PAIR, "--set", "tissues.1=rigid"], "tissues and sliding name labels (1), but there is no --tissue"),
-        (_tissue(2, 5), WITH_TISSUE, "tissue.png has the labels 2, 5, and the settings say what they are: add --set"),
+        (_tissue(2, 5), WITH_TISSUE, "tissue.png has the labels 2, 5, and settings must say what they are: add --set"),
         (_tissue(2), [*WITH_TISSUE, "--set", "sliding=[3]"], "tissue.png has no label 3, which sliding names; it has"),
         (_tissue(2), [*WITH_TISSUE, "--set", "sliding=2", "--symmetric"], "symmetric: tissue is known of the fixed"),
         (_tissue(2), [*WITH_TISSUE, "--set", "tissues.2=rigd"], "did you mean 'rigid'?"),

@@ -64,7 +64,7 @@ def check_tissue(fixed: Image, tissue: Image, settings: RegistrationSettings | N
 def _unexplained(name: str, labels: Sequence[int]) -> str:
     kinds = ", ".join(kind for kind in TISSUES if kind != "rigid")
     return (
-        f"{name} has {_these(labels)}, and the settings say what they are: add --set tissues.{labels[0]}=rigid (or "
+        f"{name} has {_these(labels)}, and settings must say what they are: add --set tissues.{labels[0]}=rigid (or "
         f"{kinds}), or --set 'sliding=[{labels[0]}]'"
     )
 
