@@ -345,10 +345,14 @@ def resample_result(
 
     Returns:
         The result with both maps interpolated linearly, and repaired where that folds them; similarities are
-        those of the grid on which it was found.
+        those of the grid on which it was found. Tissue is corrected again, as interpolation changes volumes.
     """
     grid = fixed.grid
     u, inverse = (repair_folds(prolong(w, grid), grid) for w in (result.displacement, result.inverse))
+    kept, tissue = result.tissue, _tissue(_on(annotations.tissue, fixed), result.settings, u)
+    if tissue is not None:
+        u, kept = tissue.corrected(u, grid, result.settings.folds.min_determinant)
+        inverse = invert(u, grid)
     mean, largest = inverse_error(u, inverse, grid)
     return replace(
         result,
@@ -360,5 +364,6 @@ def resample_result(
         diagnosis=diagnose(u, grid),
         inverse_error_mean=mean,
         inverse_error_max=largest,
+        tissue=kept,
         evaluation=evaluate_images(fixed, result.affine, u, labels=annotations.labels, points=annotations.points),
     )

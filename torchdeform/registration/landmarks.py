@@ -28,12 +28,14 @@ class LandmarkForce:
         residuals: the displacement wanted there, likewise.
         slopes: Jacobian of the map there ``(B, D, D, n)``; None where the points move with the domain, and those of
             the two maps of a pair, half a batch apart, move against each other.
+        maps: how many maps of an item go equally far, those of the first for all items before those of the second.
     """
 
     distance: Tensor
     points: Tensor
     residuals: Tensor
     slopes: Tensor | None = None
+    maps: int = 1
 
     def load(self, grid: Grid) -> Tensor:
         """Return minus the derivative of ``distance`` by a velocity of the domain, at every node ``(B, D, *S)``."""
@@ -44,9 +46,7 @@ class LandmarkForce:
         """Return the multiple of the velocity v that brings the pairs nearest to each other, ``(B,)``."""
         moved = sample(v, self.points, grid)
         moved = moved - of_other_map(moved) if self.slopes is None else matrix_times(self.slopes, moved)
-        work, square = ((x * moved).flatten(1).sum(1) for x in (self.residuals, moved))
-        if self.slopes is None:  # the maps of a pair go the same way
-            work, square = work + of_other_map(work), square + of_other_map(square)
+        work, square = (_joint((x * moved).flatten(1).sum(1), self.maps) for x in (self.residuals, moved))
         return work / square.clamp(min=torch.finfo(v.dtype).tiny)
 
 
@@ -65,14 +65,20 @@ class ForwardLandmarks(Landmarks):
         fixed: p ``(B, D, n)`` in grid points.
         moving: q likewise.
         grid: the grid.
+        belongs: 1 for the pairs that count in a map and 0 for the others ``(B, 1, n)``; all count when None.
+        maps: of an item, which share its pairs; see `LandmarkForce`.
     """
 
-    def __init__(self, fixed: Tensor, moving: Tensor, grid: Grid) -> None:
+    def __init__(self, fixed: Tensor, moving: Tensor, grid: Grid, belongs: Tensor | None = None, maps: int = 1) -> None:
         self.fixed, self.moving, self.grid = fixed, moving, grid
+        self.belongs, self.maps = belongs, maps
 
     def evaluate(self, u: Tensor) -> LandmarkForce:
         residuals = self.moving - _mapped(u, self.fixed, self.grid)
-        return LandmarkForce(_mean_square(residuals), self.fixed, residuals, jacobian_at(u, self.fixed, self.grid))
+        slopes = jacobian_at(u, self.fixed, self.grid)
+        if self.belongs is not None:
+            residuals, slopes = residuals * self.belongs, slopes * self.belongs.unsqueeze(1)
+        return LandmarkForce(_joint(_mean_square(residuals), self.maps), self.fixed, residuals, slopes, self.maps)
 
 
 class MidspaceLandmarks(Landmarks):
@@ -98,12 +104,17 @@ class MidspaceLandmarks(Landmarks):
             self.points = self.points + leap * (_LEAP / voxels(leap, self.grid).clamp(min=_LEAP))
         self.steps = _AGAIN
         residuals = self.points - of_other_map(self.points)  # φ ∘ flow(v) takes to p what was at v from there
-        return LandmarkForce(_mean_square(residuals), self.points, residuals)
+        return LandmarkForce(_mean_square(residuals), self.points, residuals, maps=2)
 
 
 def of_other_map(values: Tensor) -> Tensor:
     """Return for each map of a pair what belongs to the other, half a batch away."""
     return values.roll(len(values) // 2, 0)
+
+
+def _joint(sums: Tensor, maps: int) -> Tensor:
+    """Return for each map ``(B,)`` the sum over the maps of its item."""
+    return sums.unflatten(0, (maps, -1)).sum(0).repeat(maps)
 
 
 def scatter_points(values: Tensor, points: Tensor, grid: Grid) -> Tensor:

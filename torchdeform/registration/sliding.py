@@ -9,15 +9,20 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from torchdeform.core.derivatives import derivative
 from torchdeform.core.fold_free import keep_faces, lowest_determinant, neighbour_mean, repair_folds
 from torchdeform.core.grid import Grid
+from torchdeform.core.warp import sample
+from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity, weighted
+from torchdeform.registration.landmarks import ForwardLandmarks
 from torchdeform.registration.optimise import Coupling, Objective, forward_objective, optimise_levels
 from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.result import Callback, LevelRecord
 from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.tissue import Tissue
 
 # How often a border is smoothed to see its direction: some 2 voxels wide.
 _ROUNDS = 4
@@ -52,8 +57,14 @@ def optimise_sides(
 
 def _sides(problem: RegistrationProblem) -> Tensor:
     """Return how much of each node belongs to each side ``(B or 1, K, *S)``: to labels that glide, and to the rest."""
-    own = problem.tissue.gliding
+    own = _tissue(problem).gliding
     return torch.cat([own, 1 - own.sum(1, keepdim=True).clamp(max=1)], dim=1)
+
+
+def _tissue(problem: RegistrationProblem) -> Tissue:
+    if problem.tissue is None:
+        raise InputError("sliding needs labels: give annotations.tissue")
+    return problem.tissue
 
 
 def _by_sides(problem: RegistrationProblem, sides: Tensor) -> RegistrationProblem:
@@ -65,8 +76,9 @@ def _by_sides(problem: RegistrationProblem, sides: Tensor) -> RegistrationProble
 
     names = ("fixed", "moving", "moving_mask", "fixed_points", "moving_points")
     masks = sides.expand(items, *sides.shape[1:]).transpose(0, 1).flatten(0, 1).unsqueeze(1)
-    shares = problem.tissue.shares
-    tissue = replace(problem.tissue, shares=shares if len(shares) == 1 else repeated(shares))
+    tissue = _tissue(problem)
+    if len(tissue.shares) > 1:
+        tissue = replace(tissue, shares=tissue.shares.repeat(count, *[1] * (tissue.shares.dim() - 1)))
     return replace(
         problem,
         fixed_mask=weighted(masks, repeated(problem.fixed_mask)),
@@ -78,12 +90,29 @@ def _by_sides(problem: RegistrationProblem, sides: Tensor) -> RegistrationProble
 def _objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
     """Return what is maximised where every side has a map: the similarity of all sides, each by its size."""
     alone = forward_objective(problem, grid, settings)
-    sides = _sides(replace(problem, tissue=problem.tissue.on(problem.grid, grid)))
+    sides = _sides_of_items(replace(problem, tissue=_tissue(problem).on(problem.grid, grid)))
     count = sides.shape[1]
-    size = problem.fixed_mask.flatten(1).mean(1)
+    size = alone.similarity.fixed_mask.flatten(1).mean(1)
     similarity = _OfAllSides(alone.similarity.similarity, size.unflatten(0, (count, -1)))
     term = replace(alone.similarity, similarity=similarity)
-    return replace(alone, similarity=term, coupling=Gliding(sides, grid))
+    return Objective(term, alone.landmarks and _landmarks(problem, grid), Gliding(sides, grid))
+
+
+def _sides_of_items(problem: RegistrationProblem) -> Tensor:
+    """Return the sides ``(B or 1, K, *S)`` of a problem that has a pair for each side and item."""
+    sides = _sides(problem)
+    return sides[: max(len(sides) // sides.shape[1], 1)]
+
+
+def _landmarks(problem: RegistrationProblem, grid: Grid) -> ForwardLandmarks | None:
+    """Return the landmarks, each of which counts in the map of the side that it lies on."""
+    if problem.pairs is None:
+        return None
+    sides, (fixed, moving) = _sides_of_items(problem), problem.pairs
+    count = sides.shape[1]
+    shares = sample(sides, fixed[: len(fixed) // count], problem.grid)  # (B, K, n)
+    belongs = one_hot(shares.argmax(1), count).to(fixed).permute(2, 0, 1).flatten(0, 1).unsqueeze(1)
+    return ForwardLandmarks(fixed, moving, grid, belongs, count)
 
 
 @dataclass(frozen=True)
@@ -169,7 +198,8 @@ def join(apart: Tensor, sides: Tensor, grid: Grid, floor: float) -> Tensor:
         ``(B, D, *S)`` without folds.
     """
     inside = smoothed((sides > 0.5).to(apart))
-    slope = sum(derivative(inside, grid, a).square() * grid.spacing[a] ** 2 for a in range(grid.dim)).sqrt()
+    slopes = [derivative(inside, grid, a) * grid.spacing[a] for a in range(grid.dim)]
+    slope = torch.stack(slopes).square().sum(0).sqrt()
     distance = (inside - 0.5) / slope.clamp(min=1e-6)  # in voxels, near the border
     width = torch.full_like(apart[:, :1, 0], _NARROWEST)
     u = apart[:, 0]

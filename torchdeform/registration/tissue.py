@@ -7,6 +7,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import restrict
 from torchdeform.deformation.incompressible import hold_volume
@@ -15,6 +16,9 @@ from torchdeform.deformation.tissue import label_fit
 from torchdeform.errors import InputError
 from torchdeform.fem.weights import Weights
 from torchdeform.registration.settings import TISSUES, RegistrationSettings
+
+# How often what is rigid is held and what that folds is repaired: twice has been enough.
+_ROUNDS = 5
 
 
 @dataclass(frozen=True)
@@ -108,13 +112,24 @@ class Tissue:
     def corrected(self, u: Tensor, grid: Grid, floor: float) -> tuple[Tensor, tuple[TissueOutcome, ...]]:
         """Return maps ``(B, D, *S)`` that keep shapes and volumes as asked for, and how well before and after that."""
         found = [(self._fits(u, grid))]
-        if (hold := self.hold(grid)) is not None:
-            u = hold(u, floor)
+        u = self._rigid(u, grid, floor)
         u = hold_volume(u, self.masks("incompressible"), grid, still=self.masks("rigid"))
+        u = repair_folds(u, grid)  # where two labels that turn leave no room between them
         found.append(self._fits(u, grid))
         nodes = (self.shares > 0.5).flatten(2).sum(2).expand(len(u), -1)
         named = zip(self.labels, self.kinds, self.sliding, nodes.unbind(1), *found, strict=True)
         return u, tuple(TissueOutcome(*one) for one in named)
+
+    def _rigid(self, u: Tensor, grid: Grid, floor: float) -> Tensor:
+        """Return maps without folds that are rigid on the rigid labels, or nearly where that folds what is around."""
+        if (hold := self.hold(grid)) is None:
+            return u
+        for _ in range(_ROUNDS):
+            held = hold(u, floor)
+            u = repair_folds(held, grid)
+            if u is held:
+                break
+        return u
 
     def _fits(self, u: Tensor, grid: Grid) -> list[TissueFit]:
         return [TissueFit(*label_fit(u, label, grid)) for label in (self.shares > 0.5).split(1, dim=1)]
