@@ -64,6 +64,20 @@ def test_it_solves_what_a_dense_solver_solves(grid, kind):
         torch.testing.assert_close(solution.value, dense_solution(system, load), rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.parametrize("kind", DEAR)
+def test_an_item_without_dear_elements_is_solved_beside_one_that_has_some(kind):
+    grid = Grid((9, 12))
+    labels = torch.cat([inside(grid, "ball"), torch.zeros(1, 1, *grid.shape, dtype=torch.bool)]).long()
+    weights = weights_of_labels(labels, {1: DEAR[kind]}, SOFT, grid).to(torch.zeros(1, dtype=torch.float64))
+    system = DivCurlSystem(grid, weights)
+    load = smooth_load(system, 2)
+    found = solver_of(SolverSettings(method="stress", rtol=1e-9), system).init(system, load).solution(load)
+    assert found.ok
+    for item, own in ((0, system_of(grid, kind)), (1, DivCurlSystem(grid, SOFT))):
+        one = slice(item, item + 1)
+        torch.testing.assert_close(found.value[one], dense_solution(own, load[one]), rtol=1e-7, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("kind", "shape", "most"),
     [
