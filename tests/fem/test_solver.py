@@ -73,7 +73,7 @@ def test_auto_takes_the_direct_solver_where_it_is_exact():
     assert isinstance(solver_of("auto", exact).init(exact, load_of(exact)), TransformFactor)
     for system in (varying, held):
         chosen = solver_of("auto", system)
-        assert chosen == ConjugateGradient(preconditioner=PRECONDITIONERS["transform"])
+        assert chosen == ConjugateGradient(assembled=True, preconditioner=PRECONDITIONERS["transform"])
         assert chosen.preconditioner.__self__ == FastTransform(approximate=True)
         with pytest.raises(InputError, match="transform is not exact"):
             solver_of("transform", system).init(system, load_of(exact))

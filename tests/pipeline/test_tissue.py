@@ -135,4 +135,5 @@ def test_labels_of_another_image_are_refused_once(labels, sentence):
 def test_without_settings_the_labels_are_a_note():
     (found,) = check_tissue(image_of((20, 20)), labelled((20, 20), {2: (4, 9)}))
     assert found.severity == NOTE
-    assert found.text.startswith("tissue.nii has the label 2, and settings must say what they are: add --set tissues.2=")
+    said = "tissue.nii has the label 2, and settings must say what they are: add --set tissues.2="
+    assert found.text.startswith(said)

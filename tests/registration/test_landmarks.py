@@ -9,7 +9,7 @@ from torch import Tensor
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import sample, warp
 from torchdeform.registration.deformable import register
-from torchdeform.registration.landmarks import scatter_points
+from torchdeform.registration.landmarks import ForwardLandmarks, scatter_points
 from torchdeform.registration.problem import Annotations
 
 QUICK = settings_of(steps=(30, 20, 10), weight_div=1.0, length_scale=6.0, window=7, align="none")
@@ -80,3 +80,44 @@ def test_spreading_is_the_transpose_of_interpolation(shape):
     at_points = (sample(field, points, grid) * values).flatten(1).sum(1)
     at_nodes = (field * scatter_points(values, points, grid)).flatten(1).sum(1)
     torch.testing.assert_close(at_points, at_nodes)
+
+
+@pytest.mark.parametrize("shape", [(12, 14), (8, 9, 7)])
+def test_maps_that_share_the_pairs_of_an_item_feel_their_own_and_go_equally_far(shape):
+    """Against a force for each part of the pairs alone, and the best multiple by trying many."""
+    grid, generator = Grid(shape), torch.Generator().manual_seed(3)
+    u, v = 0.2 * torch.randn(2, 4, grid.dim, *shape, generator=generator, dtype=torch.float64)
+    extent = torch.tensor(grid.extent, dtype=torch.float64).view(1, -1, 1)
+    ends = [torch.rand(2, grid.dim, 10, generator=generator, dtype=torch.float64) * extent for _ in "pq"]
+    belongs = torch.zeros(4, 1, 10, dtype=torch.float64)
+    belongs[:2, :, :4], belongs[2:, :, 4:] = 1, 1
+    several = [end.repeat(2, 1, 1) for end in ends]
+    force = ForwardLandmarks(*several, grid, belongs, 2).evaluate(u)
+    parts = [slice(4), slice(4, None)]
+    alone = [
+        ForwardLandmarks(*(end[..., part] for end in ends), grid).evaluate(half)
+        for part, half in zip(parts, u.chunk(2), strict=True)
+    ]
+    load = torch.cat([one.load(grid) * (share / 10) for one, share in zip(alone, (4, 6), strict=True)])
+    torch.testing.assert_close(force.load(grid), load)
+    distance = alone[0].distance * 0.4 + alone[1].distance * 0.6
+    torch.testing.assert_close(force.distance, distance.repeat(2))
+    multiple = force.line_search(v, grid)
+    torch.testing.assert_close(multiple[:2], multiple[2:])
+    moved = sample(v, several[0], grid)
+    moved = torch.einsum("bijn,bjn->bin", force.slopes, moved)
+
+    def left(t: Tensor) -> Tensor:
+        away = (force.residuals - t.view(-1, 1, 1) * moved).square().flatten(1).sum(1)
+        return away[:2] + away[2:]
+
+    for nearby in (multiple + 1e-2, multiple - 1e-2):
+        assert (left(multiple) < left(nearby)).all()
+
+
+def test_a_map_without_pairs_of_its_own_is_not_pulled():
+    grid, points = Grid((12, 14)), torch.full((2, 2, 3), 5.0)
+    belongs = torch.tensor([1.0, 0.0]).view(2, 1, 1)
+    load = ForwardLandmarks(points, points + 1, grid, belongs, 2).evaluate(torch.zeros(2, 2, 12, 14)).load(grid)
+    assert load[0].any()
+    assert not load[1].any()

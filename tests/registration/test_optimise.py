@@ -1,11 +1,13 @@
 """The loop over levels: which carry a coarser map, and that it finds the motion all the same."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from nested_settings import settings_of
-from pictures import bend, blobs
+from pictures import bend, blobs, disc
+from tissues import kabsch_residual, turning_bars
 
 from torchdeform.core.diagnostics import one_sided_determinant
 from torchdeform.core.flow import integrate
@@ -14,6 +16,8 @@ from torchdeform.core.resampling import coarsened
 from torchdeform.core.warp import warp
 from torchdeform.registration import optimise as levels
 from torchdeform.registration.deformable import register
+from torchdeform.registration.problem import Annotations, RegistrationProblem
+from torchdeform.registration.tissue import Tissue
 from torchdeform.registration.velocity import VelocityMetric
 
 
@@ -90,3 +94,62 @@ def test_every_registration_integrates_by_torchdiffeq_and_solves_as_it_is_told(m
     frame = register(fixed, moving, settings_of(steps=(4, 3), flow="rk4", flow__steps=4, solver="assembled"))
     assert set(calls) == {"rk4"}
     assert (frame.displacement - plain.displacement).square().sum(1).sqrt().mean() < 0.05
+
+
+def tissue_of(labels: torch.Tensor, kind: str) -> Tissue:
+    return Tissue.of(labels, settings_of(tissues={1: kind}), torch.zeros(1, dtype=torch.float64))
+
+
+def test_a_step_leaves_rigid_what_is_rigid():
+    grid = Grid((40, 44))
+    labels, v = disc(grid.shape, (20, 22), 8), bend(grid, 2.0).double()
+    tissue = tissue_of(labels, "rigid")
+    level, zero = level_of(grid), torch.zeros_like(v)
+    free = levels.fold_free_step(level, state_of(zero, grid), v)
+    held = levels.fold_free_step(replace(level, tissue=tissue, hold=tissue.hold(grid)), state_of(zero, grid), v)
+    residuals = [kabsch_residual(found[1][0], labels[0, 0] > 0) for found in (free, held)]
+    assert residuals[1] < 1e-6 < 0.1 < residuals[0]
+    torch.testing.assert_close(held[2], one_sided_determinant(held[1], grid))
+    assert held[2].min() > 0.03
+
+
+def test_what_has_a_price_is_not_smoothed():
+    """The elastic smoothing of a map would take off what a tissue has turned."""
+    grid = Grid((40, 44))
+    labels, u = disc(grid.shape, (20, 22), 10), bend(grid, 1.0).double()
+    level = level_of(grid)
+    level = replace(level, settings=settings_of(elasticity=0.5), tissue=tissue_of(labels, "stiff"))
+    _, moved, _ = levels.fold_free_step(level, state_of(u, grid), torch.zeros_like(u))
+    away = (moved - u).abs().amax(1, keepdim=True)
+    assert away[labels > 0].max() < 1e-6 < 1e-4 < away[labels == 0].max()
+
+
+def test_a_level_has_the_tissue_of_its_map(monkeypatch):
+    _, moving, labels = turning_bars()
+    settings = settings_of(tissues={1: "rigid", 2: "stiff"})
+    tissue = Tissue.of(labels, settings, moving)
+    problem = RegistrationProblem(Grid((64, 64)), moving, moving, tissue=tissue)
+    monkeypatch.setattr(levels, "_LARGE", 1000)
+    level = levels.make_level(problem, settings.decided(), levels.forward_objective, 0, 1)
+    assert level.grid != problem.grid
+    assert level.tissue.shares.shape[2:] == level.grid.shape
+    assert level.hold is not None
+    assert (
+        levels.make_level(replace(problem, tissue=None), settings.decided(), levels.forward_objective, 0, 1).hold
+        is None
+    )
+
+
+def test_large_levels_keep_rigid_what_is_rigid(monkeypatch):
+    monkeypatch.setattr(levels, "_LARGE", 2000)
+    fixed, moving, labels = turning_bars()
+    settings = settings_of(tissues={1: "rigid", 2: "rigid"}, steps=(20, 15, 10), window=7)
+    result = register(fixed, moving, settings, annotations=Annotations(tissue=labels))
+    assert max(kabsch_residual(result.displacement[0], labels[0, 0] == number) for number in (1, 2)) < 0.05
+    assert result.diagnosis.folds.item() == 0
+
+
+def test_maps_of_a_batch_are_by_themselves_without_a_coupling():
+    coupling, v = levels.Coupling(), torch.randn(2, 2, 5, 6)
+    for same in (coupling.velocity, coupling.extended, coupling.counted, coupling.all, coupling.together):
+        assert same(v) is v

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nested_settings import changed, settings_of
 from pictures import bend, blobs, disc
+from tissues import BARS, turning_bars
 from torch import Tensor
 
 from torchdeform.core.grid import Grid
@@ -18,7 +19,8 @@ from torchdeform.core.warp import sample, warp
 from torchdeform.errors import InputError
 from torchdeform.registration.deformable import register
 from torchdeform.registration.optimise import forward_similarity
-from torchdeform.registration.problem import Annotations, moved, placed_images, resample_pair
+from torchdeform.registration.problem import Annotations, RegistrationProblem, moved, placed_images, resample_pair
+from torchdeform.registration.tissue import Tissue
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
@@ -374,3 +376,34 @@ def test_a_few_slices_far_apart_do_not_bend_the_map():
     errors = [(w - u)[seen].norm(dim=1).mean() for w in (torch.zeros_like(u), result.displacement)]
     assert errors[1] < errors[0]
     assert not result.displacement[:, 0].any()
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int64, torch.float32, torch.float64])
+def test_tissue_may_have_any_type_of_number(dtype):
+    fixed, moving, labels = turning_bars()
+    settings = changed(QUICK, steps=(3,), tissues=BARS)
+    results = [register(fixed, moving, settings, annotations=Annotations(tissue=labels.to(t))) for t in (dtype, None)]
+    assert torch.equal(results[0].displacement, results[1].displacement)
+
+
+def test_tissue_goes_along_with_the_problem():
+    fixed, moving, labels = turning_bars()
+    given = Annotations(tissue=labels)
+    assert torch.equal(given.to("cpu").tissue, labels)
+    tissue = Tissue.of(labels, settings_of(tissues=BARS), fixed)
+    problem, coarse = RegistrationProblem(Grid((64, 64)), fixed, moving, tissue=tissue), Grid((32, 32), (63 / 31,) * 2)
+    assert problem.on(problem.grid) is problem
+    assert problem.on(coarse).tissue.shares.shape == (1, 2, 32, 32)
+    assert problem.scaled(settings_of().decided()).tissue is tissue
+
+
+def test_tissue_of_another_size_or_kind_is_named():
+    grid, image = Grid((12, 14)), Image(torch.zeros(1, 1, 12, 14), Grid((12, 14)), name="parts")
+    with pytest.raises(InputError, match=r"tissue must have shape \(2, 1, 12, 14\), got \(3, 1, 12, 14\)"):
+        Annotations(tissue=torch.zeros(3, 1, 12, 14)).require_tensors(grid, 2)
+    with pytest.raises(InputError, match="tissue must be a tensor, because the images are"):
+        Annotations(tissue=image).require_tensors(grid, 1)
+    with pytest.raises(InputError, match="tissue must be an Image, because the images are"):
+        Annotations(tissue=image.data).require_images(2)
+    with pytest.raises(InputError, match="tissue: parts must be 3D with one channel"):
+        Annotations(tissue=image).require_images(3)

@@ -7,7 +7,7 @@ from nested_settings import settings_of
 
 from torchdeform.errors import InputError
 from torchdeform.pipeline.config import load_settings
-from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.settings import TISSUES, RegistrationSettings
 
 
 def test_settings_keep_what_they_were_made_with():
@@ -51,3 +51,41 @@ def test_auto_is_decided_by_what_is_compared():
     given = settings_of(similarity="mi").decided("mind")
     assert (given.similarity.measure, given.start) == ("mi", "identity")
     assert settings_of(similarity="mind", start="identity").decided().start == "identity"
+
+
+def test_tissue_may_be_named_or_priced():
+    given = {1: "rigid", 2: {"div": 3.0, "curl": 0.0, "strain": 0.5}}
+    settings = settings_of(tissues=given, sliding=(2, 5))
+    given[1] = "free"
+    assert settings.tissues == {1: "rigid", 2: {"div": 3.0, "curl": 0.0, "strain": 0.5}}
+    assert settings.knows_tissue
+    assert settings_of(sliding=(1,)).knows_tissue
+    assert not settings_of().knows_tissue
+    assert settings.decided("mind").tissues == settings.tissues
+    assert load_settings(overrides=asdict(settings)) == settings
+
+
+@pytest.mark.parametrize("kind", TISSUES)
+def test_kinds_of_tissue_cost_what_settings_may_say(kind):
+    assert settings_of(tissues={1: TISSUES[kind]}).tissues == {1: TISSUES[kind]}
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"tissues": {1: "bone"}}, "tissues: label 1 must be one of"),
+        ({"tissues": {1: "ridgid"}}, "did you mean 'rigid'"),
+        ({"tissues": {2: {"shear": 1.0}}}, "tissues: label 2 must be one of"),
+        ({"tissues": {2: {"div": 0.0}}}, "label 2: div must be finite and positive, got 0"),
+        ({"tissues": {2: {"strain": -1.0}}}, "label 2: strain must be finite and at least 0, got -1"),
+        ({"tissues": {2: {"curl": float("inf")}}}, "label 2: curl must be finite and at least 0, got inf"),
+        ({"tissues": {2: {"div": float("nan")}}}, "label 2: div must be finite and positive, got nan"),
+        ({"tissues": {2: {"curl": 0.0}}}, "curl and strain must not both be 0"),
+        ({"tissues": {0: "rigid"}}, "tissues: labels are whole numbers from 1"),
+        ({"sliding": (0,)}, "sliding: labels are whole numbers from 1"),
+        ({"sliding": (-3,)}, "sliding: labels are whole numbers from 1"),
+    ],
+)
+def test_tissue_that_cannot_be_is_named(values, said):
+    with pytest.raises(InputError, match=said):
+        settings_of(**values)

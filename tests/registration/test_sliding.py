@@ -6,16 +6,18 @@ import pytest
 import torch
 from nested_settings import changed, settings_of
 from pictures import blobs, disc
-from tissues import sliding_blocks
+from tissues import kabsch_residual, sliding_blocks
 from torch import Tensor
 
 from torchdeform.core.diagnostics import diagnose
 from torchdeform.core.grid import Grid
+from torchdeform.core.image import Image
 from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
+from torchdeform.metrics.base import Similarity
 from torchdeform.registration.deformable import register
 from torchdeform.registration.problem import Annotations
-from torchdeform.registration.sliding import Gliding, join
+from torchdeform.registration.sliding import Gliding, _OfAllSides, join
 
 QUICK = settings_of(steps=(30, 24, 16), window=7)
 GRIDS = [Grid((40, 48), (1.0, 0.6)), Grid((20, 22, 24), (1.0, 0.6, 0.8))]
@@ -234,3 +236,36 @@ def test_sliding_needs_labels():
     fixed, moving, _, _ = sliding_blocks()
     with pytest.raises(InputError, match=r"annotations\.tissue is not given"):
         register(fixed, moving, changed(QUICK, sliding=(1,)))
+
+
+def test_all_sides_are_as_similar_as_they_are_together():
+    class Brightness(Similarity):
+        def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+            return warped.flatten(1).mean(1), torch.ones_like(warped)
+
+    maps = (
+        torch.tensor([1.0, 2.0, 3.0, 4.0]).view(4, 1, 1, 1).expand(4, 1, 5, 5)
+    )  # two items on one side, and the other
+    sizes = torch.tensor([[0.25, 0.5], [0.75, 0.5]])
+    value, slope = _OfAllSides(Brightness(), sizes).evaluate(maps)
+    assert value.tolist() == [0.25 * 1 + 0.75 * 3, 0.5 * 2 + 0.5 * 4] * 2
+    assert torch.equal(slope, torch.ones_like(maps))
+
+
+def test_bones_may_lie_in_what_slides():
+    fixed, moving, upper, _ = sliding_blocks()
+    labels = upper + disc((64, 72), (32, 55), 6)  # 2 in 1
+    settings = changed(QUICK, sliding=(1,), tissues={2: "rigid"})
+    result = register(fixed, moving, settings, annotations=Annotations(tissue=labels))
+    assert kabsch_residual(result.displacement[0], labels[0, 0] == 2) < 0.05
+    assert result.diagnosis.folds.item() == 0
+
+
+def test_images_slide_in_their_own_unit():
+    fixed, moving, upper, truth = sliding_blocks()
+    grid = Grid((64, 72), (0.5, 0.5))
+    images, tissue = [Image(part, grid) for part in (fixed, moving)], Image(upper, grid)
+    settings = changed(QUICK, sliding=(1,), align="none")
+    result = register(*images, settings, annotations=Annotations(tissue=tissue))
+    assert error_at(2 * result.displacement, truth) < 0.5
+    assert result.diagnosis.folds.item() == 0

@@ -9,7 +9,9 @@ from nested_settings import settings_of
 from torchdeform.core.grid import Grid, per_item
 from torchdeform.fem.div_curl import solve_div_curl
 from torchdeform.fem.solver import SolverSettings
+from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
+from torchdeform.registration.tissue import Tissue
 from torchdeform.registration.velocity import (
     VelocityMetric,
     fold_barrier,
@@ -92,3 +94,81 @@ def test_steps_fall_to_a_tenth():
     assert math.isclose(step_size(optimiser, 10, 10), 0.2)
     assert math.isclose(step_size(optimiser, 5, 10), 1.1)
     assert per_item(torch.ones(2), torch.ones(2, 1, 3, 3)).shape == (2, 1, 1, 1)
+
+
+def tissue_on(grid: Grid, labels: torch.Tensor | None = None) -> Tissue:
+    """A rigid and an own tissue; half of the first axis each, unless labels are given."""
+    if labels is None:
+        node = torch.arange(grid.shape[0]).view(1, 1, -1, *[1] * (grid.dim - 1))
+        labels = (node >= 3).long() + (node >= 2 * grid.shape[0] // 3)
+        labels = labels.expand(1, 1, *grid.shape)
+    chosen = settings_of(tissues={1: "rigid", 2: {"div": 5.0, "strain": 2.0, "curl": 0.0}})
+    return Tissue.of(labels, chosen, torch.zeros(1, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_with_tissue_a_velocity_is_that_of_the_weights_by_element(grid):
+    force, tissue, exact = field(grid, grid.dim), tissue_on(grid), SolverSettings(rtol=1e-12)
+    metric = VelocityMetric.of(grid, SETTINGS.metric, exact, force, tissue=tissue)
+    weights = tissue.weights(metric.system.weights)
+    v = metric.velocity(force, near=torch.ones_like(force))
+    system = DivCurlSystem(grid, weights, "slip")
+    load, product = metric.system.load(force=force), system.product(force)(v)
+    # What leads out of the box is given there.
+    for axis in range(grid.dim):
+        load[:, axis], product[:, axis] = (inner(part[:, axis], axis) for part in (load, product))
+    torch.testing.assert_close(product, load, rtol=1e-7, atol=1e-7)
+
+
+def inner(component: torch.Tensor, axis: int) -> torch.Tensor:
+    """A component ``(B, *S)`` that is 0 on the two faces across an axis."""
+    node = torch.arange(component.shape[axis + 1]).view([-1 if a == axis + 1 else 1 for a in range(component.dim())])
+    return torch.where((node == 0) | (node == component.shape[axis + 1] - 1), 0, component)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_tissue_is_solved_to_a_share_of_the_load_unless_told_otherwise(grid):
+    force, tissue = field(grid, grid.dim), tissue_on(grid)
+    exact = VelocityMetric.of(grid, SETTINGS.metric, SolverSettings(rtol=1e-12), force, tissue=tissue).ascent(force)
+    metric = VelocityMetric.of(grid, SETTINGS.metric, SETTINGS.solver, force, tissue=tissue)
+    rough, again = metric.ascent(force), metric.ascent(force, near=exact)
+    sizes = exact.flatten(1).norm(dim=1)
+    assert ((again - exact).flatten(1).norm(dim=1) < 1e-2 * sizes).all()
+    assert ((rough - exact).flatten(1).norm(dim=1) < 0.5 * sizes).all()
+    work = (rough * metric.system.mass(force)).flatten(1).sum(1)
+    assert (work > 0).all()
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_tissue_without_prices_is_no_tissue(grid):
+    force = field(grid, grid.dim)
+    labels = torch.ones(1, 1, *grid.shape)
+    free = Tissue.of(labels, settings_of(tissues={1: "free"}), force)
+    plain = VelocityMetric.of(grid, SETTINGS.metric, SETTINGS.solver, force)
+    found = VelocityMetric.of(grid, SETTINGS.metric, SETTINGS.solver, force, tissue=free)
+    assert found.system.weights == plain.system.weights
+    torch.testing.assert_close(found.ascent(force), plain.ascent(force), rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_a_rigid_box_moves_as_one(grid):
+    """A force on a part of a dear tissue moves all of it nearly alike, and bends what is not dear."""
+    labels, force = torch.zeros(1, 1, *grid.shape), torch.zeros(1, grid.dim, *grid.shape, dtype=torch.float64)
+    box = (..., *[slice(2, n - 2) for n in grid.shape])
+    labels[box] = 1
+    force[(0, 0, *[n // 2 for n in grid.shape])] = 1
+    spread = []
+    for kind in ("free", "rigid"):
+        tissue = Tissue.of(labels, settings_of(tissues={1: kind}), force)
+        v = VelocityMetric.of(grid, SETTINGS.metric, SolverSettings(rtol=1e-10), force, tissue=tissue).ascent(force)
+        inside = v[:, 0][box].flatten()
+        spread.append(float(inside.std() / inside.mean()))
+    assert spread[1] < 0.3 * spread[0]
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_items_that_are_scaled_together_keep_their_proportions(grid):
+    v = field(grid, grid.dim) * torch.tensor([1.0, 3.0]).view(2, 1, *[1] * grid.dim)
+    together = normalise_step(v, grid, lambda sizes: sizes.amax().expand_as(sizes))
+    torch.testing.assert_close(together[0] / together[1], v[0] / v[1])
+    assert max_norm(together / grid.along(grid.spacing, v)).amax() == pytest.approx(1.0)

@@ -28,7 +28,8 @@ class SolverSettings:
             conjugate gradients without a stored matrix), ``assembled`` (the same with the matrix, assembled as torch
             sparse COO; beyond 1.8 million nodes in 2D and 270,000 in 3D without it), ``stress`` (for the stress
             in elements that are far dearer than all others, see `StressGuess`), or ``auto``: ``transform`` where it
-            is exact, ``stress`` where it suits, else ``cg``. All have the same answer.
+            is exact, ``stress`` where it suits, else ``assembled`` for a small matrix, else ``cg``. All have the same
+            answer.
         preconditioner: of conjugate gradients: ``transform`` (the direct solver with the weights that are
             typical; where it is exact one step is enough), ``jacobi`` (the diagonal), ``none``.
         rtol: solved when ‖load − K v‖ ≤ max(rtol ‖load‖, atol). None asks for 1e-5 in float32 and 1e-10 in float64.
@@ -62,13 +63,18 @@ def solver_of(settings: SolverSettings | str, system: DivCurlSystem) -> LinearSo
         raise InputError("solver: stress is for weights of which some are far dearer than others; take auto or cg")
     if how.method == "transform" or (how.method == "auto" and is_exact_for(system)):
         return FastTransform(rtol=how.rtol, atol=how.atol)
-    entries = system.matrix_entries
-    small = how.method == "auto" and entries <= SMALL_MATRIX and all(w.dim() == 0 or len(w) == 1 for w in system.weights.tensors)
     return ConjugateGradient(
-        assembled=small or (how.method == "assembled" and entries <= LARGEST_MATRIX),
+        assembled=_is_assembled(how.method, system),
         preconditioner=PRECONDITIONERS[how.preconditioner],
         rtol=how.rtol,
         atol=how.atol,
         max_steps=how.max_steps,
         guess=StressGuess if how.method == "stress" or (how.method == "auto" and suits(system)) else None,
     )
+
+
+def _is_assembled(method: str, system: DivCurlSystem) -> bool:
+    if method == "auto":
+        one = all(weight.dim() == 0 or len(weight) == 1 for weight in system.weights.tensors)
+        return one and system.matrix_entries <= SMALL_MATRIX
+    return method == "assembled" and system.matrix_entries <= LARGEST_MATRIX

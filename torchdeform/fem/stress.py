@@ -65,7 +65,7 @@ class StressGuess:
         weigh, local, back = [], [], []
         for small, unit, e in zip(minor, units, self.excess.excess, strict=True):
             dearest = e.amax(dim=2, keepdim=True)
-            dearest = torch.where(dearest > 0, dearest, 1)  # of an item that has none, whose stress stays 0
+            dearest = torch.where(dearest > 0, dearest, 1)  # an item may have nothing that is dear
             bounded = small or lone
             stretch = (e / (e + limit) if bounded else e / dearest).sqrt()
             weigh.append(unit**0.5 * stretch)

@@ -1,7 +1,7 @@
 """The weights of the div-curl least squares: what divergence, rotation, change of shape and velocity cost."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -153,7 +153,7 @@ class Weights:
 
 
 def weights_of_labels(labels: Tensor, by_label: Mapping[int, Weights], rest: Weights, grid: Grid) -> Weights:
-    """Return the weights of tissues that are given as labels, soft over one voxel.
+    """Return the weights of tissues that are given as labels, soft over one voxel; see `weights_of_shares`.
 
     Args:
         labels: whole numbers at the nodes ``(B, 1, *S)``.
@@ -161,25 +161,34 @@ def weights_of_labels(labels: Tensor, by_label: Mapping[int, Weights], rest: Wei
         rest: what all other labels cost, in numbers.
         grid: the grid.
 
-    Returns:
-        Weights by element ``(B, 1, *E)``, each the mean of what the corners cost, in the floating type of torch; a
-        number where all labels cost the same.
-
     Raises:
         InputError: shape.
     """
     if tuple(labels.shape[1:]) != (1, *grid.shape):
         want = ", ".join(map(str, grid.shape))
         raise InputError(f"weights_of_labels: labels must have shape (B, 1, {want}), got {tuple(labels.shape)}")
-    costs = {}
+    shares = [labels == label for label in by_label] or [torch.zeros_like(labels)]
+    return weights_of_shares(torch.cat(shares, dim=1).to(torch.get_default_dtype()), list(by_label.values()), rest)
+
+
+def weights_of_shares(shares: Tensor, tissues: Sequence[Weights], rest: Weights) -> Weights:
+    """Return the weights of nodes of which tissues have shares.
+
+    Args:
+        shares: how much of each node a tissue has ``(B, L, *S)``, in sum at most 1.
+        tissues: what they cost, in numbers.
+        rest: what costs what is left of a node, in numbers.
+
+    Returns:
+        Weights by element ``(B, 1, *E)``, each the mean of what the corners cost; a number where all cost the same.
+    """
+    share, costs = _corner_mean(shares), {}
     for field in fields(Weights):
-        values = {label: getattr(weights, field.name) for label, weights in by_label.items()}
         costs[field.name] = other = getattr(rest, field.name)
-        if any(value != other for value in values.values()):
-            nodes = torch.full(labels.shape, float(other), device=labels.device)
-            for label, value in values.items():
-                nodes[labels == label] = value
-            costs[field.name] = _corner_mean(nodes)
+        more = [getattr(tissue, field.name) - other for tissue in tissues]
+        if any(more):
+            column = share.new_tensor(more).view(1, -1, *[1] * (share.dim() - 2))
+            costs[field.name] = other + (share * column).sum(1, keepdim=True)
     return Weights(**costs)
 
 

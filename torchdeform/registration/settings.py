@@ -202,7 +202,7 @@ def require_tissue(label: int, tissue: Tissue) -> None:
         return
     for name, price in tissue.items():
         require_choice(name, PRICES, where)
-        if not 0 <= price < math.inf or (name == "div" and price == 0):
+        if isinstance(price, bool) or not 0 <= price < math.inf or (name == "div" and price == 0):
             wanted = "positive" if name == "div" else "at least 0"
             raise InputError(f"{where}: {name} must be finite and {wanted}, got {price}")
     if tissue.get("curl") == 0 and not tissue.get("strain"):

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import product
 
 import torch
 from torch import Tensor
@@ -14,7 +13,7 @@ from torchdeform.deformation.incompressible import hold_volume
 from torchdeform.deformation.rigid import RigidHold
 from torchdeform.deformation.tissue import label_fit
 from torchdeform.errors import InputError
-from torchdeform.fem.weights import Weights
+from torchdeform.fem.weights import Weights, weights_of_shares
 from torchdeform.registration.settings import TISSUES, RegistrationSettings
 
 # How often what is rigid is held and what that folds is repaired: twice has been enough.
@@ -143,14 +142,8 @@ class Tissue:
         """Return what a velocity costs in each element, ``base`` where there is no label."""
         if not any(self.prices):
             return base
-        share = _means_of_corners(self.shares)
-        parts = {}
-        for name in ("div", "curl", "strain"):
-            usual = getattr(base, name)
-            more = [price.get(name, usual) - usual for price in self.prices]
-            weight = usual + (share * share.new_tensor(more).view(1, -1, *[1] * (share.dim() - 2))).sum(1, keepdim=True)
-            parts[name] = weight
-        return Weights(zero=base.zero, **parts)
+        tissues = [replace(base, **price) for price in self.prices]
+        return weights_of_shares(self.shares, tissues, base)
 
     @property
     def gliding(self) -> Tensor:
@@ -162,16 +155,3 @@ class Tissue:
         """The share of each node ``(B or 1, 1, *S)`` that no price holds."""
         held = [k for k, price in enumerate(self.prices) if price]
         return 1 - self.shares[:, held].sum(1, keepdim=True).clamp(max=1)
-
-
-def _corners(field: Tensor) -> list[Tensor]:
-    """Return the values ``(B, C, *E)`` at each corner of every element of a field ``(B, C, *S)``."""
-    return [
-        field[(..., *(slice(1, None) if side else slice(-1) for side in corner))]
-        for corner in product((0, 1), repeat=field.dim() - 2)
-    ]
-
-
-def _means_of_corners(field: Tensor) -> Tensor:
-    corners = _corners(field)
-    return sum(corners[1:], start=corners[0]) / len(corners)
