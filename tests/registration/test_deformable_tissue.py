@@ -13,6 +13,7 @@ from torchdeform.core.diagnostics import diagnose, inverse_error
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.core.resampling import restrict
+from torchdeform.core.warp import warp
 from torchdeform.errors import InputError
 from torchdeform.registration.deformable import register, resample_result
 from torchdeform.registration.problem import Annotations
@@ -137,6 +138,30 @@ def test_on_a_finer_grid_tissue_is_kept_as_well(kind):
     assert kind != "rigid" or kabsch_residual(result.displacement[0], labels.data[0, 0] == 1) < 0.05
     assert result.diagnosis.folds.item() == 0
     assert float(inverse_error(result.displacement, result.inverse, fixed.grid)[1]) < 0.2
+
+
+@pytest.mark.parametrize("settings", [{"tissues": {1: "rigid"}}, {"tissues": {1: "incompressible"}}, {"sliding": (1,)}])
+def test_nothing_is_moved_across_a_few_slices_whatever_they_are_made_of(settings):
+    shape, labels = (5, 40, 44), torch.zeros(1, 1, 5, 40, 44)
+    labels[:, :, 1:4, 10:25, 10:30] = 1
+    u = torch.cat([torch.zeros(1, 1, 40, 44), bend(Grid(shape[1:]), 2.0)], dim=1).unsqueeze(2).expand(1, 3, *shape)
+    moving = blobs((40, 44), 1).unsqueeze(2) + 0.3 * blobs(shape, 4)
+    fixed = warp(moving, u, Grid(shape))
+    chosen = changed(QUICK, steps=(8, 6), **settings)
+    result = register(fixed, moving, chosen, annotations=Annotations(tissue=labels))
+    assert not result.displacement[:, 0].any()
+    assert not result.diagnosis.folds.any()
+    (one,) = result.tissue
+    assert one.kind != "rigid" or float(one.after.residual) < 0.05
+    assert one.kind != "incompressible" or float(one.after.off) < 0.01
+
+
+def test_items_may_lack_all_that_is_dear():
+    fixed, moving, labels = (torch.cat([part, part]) for part in turning_bars())
+    labels[1] = 0
+    result = register(fixed, moving, changed(QUICK, tissues=BARS), annotations=Annotations(tissue=labels))
+    assert max(away_from_rigid(result, labels)) < 0.05
+    assert not result.diagnosis.folds.any()
 
 
 def test_a_start_that_bends_what_is_rigid_ends_rigid_and_without_folds():

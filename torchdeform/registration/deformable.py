@@ -272,7 +272,7 @@ def _optimise(
         u, after, before = best_map(objective, settings, u, *([] if start is None else [start]), zero)
         values = before, after
         if problem.tissue is not None:
-            u, kept = problem.tissue.corrected(u, problem.grid, settings.folds.min_determinant)
+            u, kept = problem.tissue.corrected(u, problem.grid, settings.folds.min_determinant, problem.held)
             values = tuple(objective.similarity.on_common_voxels([zero, u]))
         marks = values if settings.similarity.measure == "lncc" else _marks(problem, settings, zero, u)
     return _Optimised(u, records, values, marks, perf_counter() - began, kept)
@@ -351,7 +351,8 @@ def resample_result(
     u, inverse = (repair_folds(prolong(w, grid), grid) for w in (result.displacement, result.inverse))
     kept, tissue = result.tissue, _tissue(_on(annotations.tissue, fixed), result.settings, u)
     if tissue is not None:
-        u, kept = tissue.corrected(u, grid, result.settings.folds.min_determinant)
+        held = [axis for axis, part in enumerate(u.unbind(1)) if not bool(part.any())]
+        u, kept = tissue.corrected(u, grid, result.settings.folds.min_determinant, held)
         inverse = invert(u, grid)
     mean, largest = inverse_error(u, inverse, grid)
     return replace(

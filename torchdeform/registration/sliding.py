@@ -5,6 +5,7 @@ divergence. The loop sees a batch of as many maps as there are sides, each compa
 map goes on smoothly, and in the end every node takes that of its own side.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,7 +19,7 @@ from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity, weighted
 from torchdeform.registration.landmarks import ForwardLandmarks
-from torchdeform.registration.optimise import Coupling, Objective, forward_objective, optimise_levels
+from torchdeform.registration.optimise import Coupling, Objective, forward_objective, held_still, optimise_levels
 from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.result import Callback, LevelRecord
 from torchdeform.registration.settings import RegistrationSettings
@@ -95,7 +96,7 @@ def _objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationS
     size = alone.similarity.fixed_mask.flatten(1).mean(1)
     similarity = _OfAllSides(alone.similarity.similarity, size.unflatten(0, (count, -1)))
     term = replace(alone.similarity, similarity=similarity)
-    return Objective(term, alone.landmarks and _landmarks(problem, grid), Gliding(sides, grid))
+    return Objective(term, alone.landmarks and _landmarks(problem, grid), Gliding(sides, grid, problem.held))
 
 
 def _sides_of_items(problem: RegistrationProblem) -> Tensor:
@@ -137,14 +138,16 @@ class Gliding(Coupling):
     Args:
         sides: how much of each node belongs to each side ``(B or 1, K, *S)``.
         grid: their grid.
+        held: axes along which nothing is moved.
     """
 
-    def __init__(self, sides: Tensor, grid: Grid) -> None:
+    def __init__(self, sides: Tensor, grid: Grid, held: Sequence[int] = ()) -> None:
         self.grid, self.count = grid, sides.shape[1]
         own = (sides > 0.5).to(sides)
         self.own, self.reach = own.unsqueeze(2), smoothed(own, _BEYOND).unsqueeze(2)
         self.shares = smoothed(own)
         slopes = torch.stack([derivative(self.shares, grid, a) for a in range(grid.dim)], dim=2)  # (B, K, D, *S)
+        slopes = held_still(slopes.flatten(0, 1), held).view_as(slopes)
         length = slopes.square().sum(2, keepdim=True).sqrt()
         self.normals = slopes / length.clamp(min=torch.finfo(sides.dtype).tiny)
         self.near = (8 * self.shares * (1 - self.shares)).clamp(max=1).unsqueeze(2)

@@ -1,6 +1,6 @@
 """What the tissue of the fixed image costs to deform, and how well it was kept."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -108,11 +108,22 @@ class Tissue:
         """Return the nodes of the labels of a kind ``(B or 1, L', *S)``, bool; each node in one label at most."""
         return self.shares[:, [k for k, one in enumerate(self.kinds) if one == kind]] > 0.5
 
-    def corrected(self, u: Tensor, grid: Grid, floor: float) -> tuple[Tensor, tuple[TissueOutcome, ...]]:
-        """Return maps ``(B, D, *S)`` that keep shapes and volumes as asked for, and how well before and after that."""
+    def corrected(
+        self, u: Tensor, grid: Grid, floor: float, held: Sequence[int] = ()
+    ) -> tuple[Tensor, tuple[TissueOutcome, ...]]:
+        """Return maps that keep shapes and volumes as asked for, and how well before and after that.
+
+        Args:
+            u: displacements ``(B, D, *S)`` in units of spacing, without folds.
+            grid: their grid.
+            floor: smallest one-sided determinant that is wanted around what is rigid.
+            held: axes along which nothing is moved.
+        """
         found = [(self._fits(u, grid))]
         u = self._rigid(u, grid, floor)
         u = hold_volume(u, self.masks("incompressible"), grid, still=self.masks("rigid"))
+        if held:
+            u = repair_folds(u.index_fill(1, torch.tensor(held, device=u.device), 0.0), grid)
         u = repair_folds(u, grid)  # where two labels that turn leave no room between them
         found.append(self._fits(u, grid))
         nodes = (self.shares > 0.5).flatten(2).sum(2).expand(len(u), -1)
