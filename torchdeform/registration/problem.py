@@ -121,6 +121,8 @@ class RegistrationProblem:
         moving_points: likewise.
         held: axes along which nothing is moved, from 0.
         tissue: what the fixed image is made of, None where nothing is said.
+        sides: how much of each node belongs to each side of borders that glide ``(B or 1, K, *S)``, where the pairs are
+            those of every side and item; None without.
     """
 
     grid: Grid
@@ -132,6 +134,7 @@ class RegistrationProblem:
     moving_points: Tensor | None = None
     held: tuple[int, ...] = ()
     tissue: Tissue | None = None
+    sides: Tensor | None = None
 
     @property
     def pairs(self) -> tuple[Tensor, Tensor] | None:
@@ -151,7 +154,7 @@ class RegistrationProblem:
         def coarser(field: Tensor | None) -> Tensor | None:
             return None if field is None else restrict(field, self.grid, coarse)
 
-        masks = {name: coarser(getattr(self, name)) for name in ("fixed_mask", "moving_mask")}
+        masks = {name: coarser(getattr(self, name)) for name in ("fixed_mask", "moving_mask", "sides")}
         images = {"fixed": restrict(self.fixed, self.grid, coarse), "moving": restrict(self.moving, self.grid, coarse)}
         tissue = self.tissue and self.tissue.on(self.grid, coarse)
         return replace(self, grid=coarse, tissue=tissue, **images, **masks)

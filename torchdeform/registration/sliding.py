@@ -15,6 +15,7 @@ from torch.nn.functional import one_hot
 from torchdeform.core.derivatives import derivative
 from torchdeform.core.fold_free import keep_faces, lowest_determinant, neighbour_mean, repair_folds
 from torchdeform.core.grid import Grid
+from torchdeform.core.resampling import restrict
 from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity, weighted
@@ -52,6 +53,7 @@ def optimise_sides(
     several = _by_sides(problem, sides)
     begun = None if start is None else start.repeat(count, *[1] * (start.dim() - 1))
     u, records = optimise_levels(several, settings, begun, shown, _objective)
+    u = _tissue(several).exact(u, problem.grid, settings.folds.min_determinant, problem.held, glides=True)
     joined = join(u.unflatten(0, (count, items)).transpose(0, 1), sides, problem.grid, settings.folds.min_determinant)
     return joined, tuple(replace(one, similarity=tuple(v[:items] for v in one.similarity)) for one in records)
 
@@ -78,12 +80,14 @@ def _by_sides(problem: RegistrationProblem, sides: Tensor) -> RegistrationProble
     names = ("fixed", "moving", "moving_mask", "fixed_points", "moving_points")
     masks = sides.expand(items, *sides.shape[1:]).transpose(0, 1).flatten(0, 1).unsqueeze(1)
     tissue = _tissue(problem)
-    if len(tissue.shares) > 1:
-        tissue = replace(tissue, shares=tissue.shares.repeat(count, *[1] * (tissue.shares.dim() - 1)))
+    # A label is there in the map of its own side alone: what it holds there does not reach beyond the border.
+    shares = tissue.shares.expand(items, *tissue.shares.shape[1:]).repeat(count, *[1] * (tissue.shares.dim() - 1))
+    tissue = replace(tissue, shares=shares * (masks > 0.5))
     return replace(
         problem,
         fixed_mask=weighted(masks, repeated(problem.fixed_mask)),
         tissue=tissue,
+        sides=sides,
         **{name: repeated(getattr(problem, name)) for name in names},
     )
 
@@ -91,7 +95,7 @@ def _by_sides(problem: RegistrationProblem, sides: Tensor) -> RegistrationProble
 def _objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
     """Return what is maximised where every side has a map: the similarity of all sides, each by its size."""
     alone = forward_objective(problem, grid, settings)
-    sides = _sides_of_items(replace(problem, tissue=_tissue(problem).on(problem.grid, grid)))
+    sides = restrict(_required(problem.sides), problem.grid, grid)
     count = sides.shape[1]
     size = alone.similarity.fixed_mask.flatten(1).mean(1)
     similarity = _OfAllSides(alone.similarity.similarity, size.unflatten(0, (count, -1)))
@@ -99,17 +103,17 @@ def _objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationS
     return Objective(term, alone.landmarks and _landmarks(problem, grid), Gliding(sides, grid, problem.held))
 
 
-def _sides_of_items(problem: RegistrationProblem) -> Tensor:
-    """Return the sides ``(B or 1, K, *S)`` of a problem that has a pair for each side and item."""
-    sides = _sides(problem)
-    return sides[: max(len(sides) // sides.shape[1], 1)]
+def _required(sides: Tensor | None) -> Tensor:
+    if sides is None:
+        raise InputError("sliding needs labels: give annotations.tissue")
+    return sides
 
 
 def _landmarks(problem: RegistrationProblem, grid: Grid) -> ForwardLandmarks | None:
     """Return the landmarks, each of which counts in the map of the side that it lies on."""
     if problem.pairs is None:
         return None
-    sides, (fixed, moving) = _sides_of_items(problem), problem.pairs
+    sides, (fixed, moving) = _required(problem.sides), problem.pairs
     count = sides.shape[1]
     shares = sample(sides, fixed[: len(fixed) // count], problem.grid)  # (B, K, n)
     belongs = one_hot(shares.argmax(1), count).to(fixed).permute(2, 0, 1).flatten(0, 1).unsqueeze(1)

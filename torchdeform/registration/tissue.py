@@ -104,9 +104,16 @@ class Tissue:
         """Return the same on a coarser grid of the same box."""
         return self if grid == coarse else replace(self, shares=restrict(self.shares, grid, coarse))
 
-    def masks(self, kind: str) -> Tensor:
-        """Return the nodes of the labels of a kind ``(B or 1, L', *S)``, bool; each node in one label at most."""
-        return self.shares[:, [k for k, one in enumerate(self.kinds) if one == kind]] > 0.5
+    def masks(self, kind: str, glides: bool | None = None) -> Tensor:
+        """Return the nodes of the labels of a kind ``(B or 1, L', *S)``, bool, of those whose borders glide or not.
+
+        Each node is in one label at most.
+        """
+        both = zip(self.kinds, self.sliding, strict=True)
+        return (
+            self.shares[:, [k for k, (one, slides) in enumerate(both) if one == kind and glides in (None, slides)]]
+            > 0.5
+        )
 
     def corrected(
         self, u: Tensor, grid: Grid, floor: float, held: Sequence[int] = ()
@@ -119,21 +126,31 @@ class Tissue:
             floor: smallest one-sided determinant that is wanted around what is rigid.
             held: axes along which nothing is moved.
         """
-        found = [(self._fits(u, grid))]
-        u = self._rigid(u, grid, floor)
-        u = hold_volume(u, self.masks("incompressible"), grid, still=self.masks("rigid"))
-        if held:
-            u = repair_folds(u.index_fill(1, torch.tensor(held, device=u.device), 0.0), grid)
-        u = repair_folds(u, grid)  # where two labels that turn leave no room between them
+        found = [self._fits(u, grid)]
+        u = self.exact(u, grid, floor, held)
         found.append(self._fits(u, grid))
         nodes = (self.shares > 0.5).flatten(2).sum(2).expand(len(u), -1)
         named = zip(self.labels, self.kinds, self.sliding, nodes.unbind(1), *found, strict=True)
         return u, tuple(TissueOutcome(*one) for one in named)
 
-    def _rigid(self, u: Tensor, grid: Grid, floor: float) -> Tensor:
-        """Return maps without folds that are rigid on the rigid labels, or nearly where that folds what is around."""
-        if (hold := self.hold(grid)) is None:
+    def exact(self, u: Tensor, grid: Grid, floor: float, held: Sequence[int] = (), glides: bool = False) -> Tensor:
+        """Return maps that keep shapes and volumes of the labels whose borders glide, or of the others.
+
+        A label with a border that glides is corrected in the map of its side, before the sides are joined.
+        """
+        rigid = self.masks("rigid", glides)
+        u = self._rigid(u, rigid, grid, floor)
+        u = hold_volume(u, self.masks("incompressible", glides), grid, still=rigid)
+        if held:
+            u = repair_folds(u.index_fill(1, torch.tensor(held, device=u.device), 0.0), grid)
+        return repair_folds(u, grid)  # where two labels that turn leave no room between them
+
+    @staticmethod
+    def _rigid(u: Tensor, masks: Tensor, grid: Grid, floor: float) -> Tensor:
+        """Return maps without folds that are rigid on the labels, or nearly where that folds what is around."""
+        if not bool(masks.any()):
             return u
+        hold = RigidHold(masks, grid)
         for _ in range(_ROUNDS):
             held = hold(u, floor)
             u = repair_folds(held, grid)
