@@ -346,7 +346,7 @@ _MARKUPS = json.dumps(
 # Tables, settings and records.
 
 _TABLE = (
-    'name,fixed,moving,settings.window,settings.optimiser.steps\na,x.nii,y.nii,5,"[3, 2]"\nb,~/x.nii,$HOME/z.nii,n/a,\n'
+    'name,fixed,moving,settings.similarity.window,settings.optimiser.steps\na,x.nii,y.nii,5,"[3, 2]"\nb,~/x.nii,$HOME/z.nii,n/a,\n'
 )
 _SETTINGS = """\
 similarity: {measure: lncc, window: 5}

@@ -102,7 +102,7 @@ def test_it_opens_at_the_worst_place(browser, page):
 def test_what_is_drawn_is_shown_and_hidden(browser, page):
     """Every kind of mark has its box in the legend and is visible until it is cleared."""
     kinds = browser.run("[...document.querySelectorAll('input[name=shown]')].map(input => input.value)")
-    assert set(kinds) - {"no-data"} == {"outlines", "landmarks", "masks", "absent", "worst"}
+    assert set(kinds) - {"no-data"} == {"outlines", "landmarks", "masks", "absent", "worst", "tissue"}
     for kind in kinds if page == 3 else set(kinds) - {"no-data"}:  # in 2D the map stays inside the moving image
         drawn = f"[...document.querySelectorAll('.stage use.{kind}:not([hidden])')]"
         seen = f"{drawn}.filter(u => getComputedStyle(u).visibility == 'visible' && u.getBBox().width > 0).length"

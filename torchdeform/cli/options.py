@@ -44,7 +44,7 @@ MovingPoints = Annotated[Path | None, optional_file("... and the same landmarks 
 FixedLabels = Annotated[Path | None, optional_file("Regions, whose overlap is measured ...")]
 MovingLabels = Annotated[Path | None, optional_file("... and the same regions of MOVING.")]
 Tissue = Annotated[
-    Path | None, optional_file("Tissue of FIXED (MOVING needs none); --set tissues.1=rigid says what 1 is.", "LABELS")
+    Path | None, optional_file("Tissue of FIXED: say what 1 is by --set tissues.1=rigid.", "LABELS")
 ]
 Device = Annotated[str, choice(DEVICES, "auto, cpu or cuda.")]
 Quiet = Annotated[bool, flag("--quiet", "Print errors only.")]

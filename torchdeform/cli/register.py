@@ -97,9 +97,8 @@ def register(
 ) -> None:
     """Warp MOVING onto FIXED: an alignment, then a map that does not fold.
 
-    Writes report.html (open it: did it work?), warped.*, transform.h5, inverse.h5, displacement.nii.gz, overview.png
-    and result.json, all or none. transform.h5 maps points from FIXED to MOVING and warps the image MOVING onto FIXED;
-    inverse.h5 does the opposite.
+    Writes report.html (open it: did it work?), warped.*, transform.h5 (warps MOVING, maps points of FIXED), inverse.h5,
+    displacement.nii.gz, overview.png and result.json, all or none.
     """
     # Options that were not given must not override the preset and the file.
     shortcuts = {"align": align, "points_weight": points_weight, "symmetric": symmetric or None}

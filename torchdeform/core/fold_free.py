@@ -113,9 +113,10 @@ def smooth_elastically(u: Tensor, share: Tensor, grid: Grid) -> Tensor:
 
     Args:
         u: displacement ``(B, D, *S)``; on the faces of the box the components that lead out of it stay as they are.
-        share: from 0 to 1, what broadcasts to ``(B, 1, *S)``.
+        share: from 0 to 1, for each item ``(B,)``, or what broadcasts to ``(B, 1, *S)``.
         grid: its grid.
     """
+    share = per_item(share, u) if share.dim() == 1 else share
     return keep_faces(torch.lerp(u, neighbour_mean(u), share.expand_as(u)), u, grid)
 
 

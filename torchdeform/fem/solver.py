@@ -74,6 +74,9 @@ def solver_of(settings: SolverSettings | str, system: DivCurlSystem) -> LinearSo
 
 
 def _is_assembled(method: str, system: DivCurlSystem) -> bool:
+    """Tell whether the matrix of a system is assembled; one matrix has one set of weights and of given unknowns."""
+    if system.also_fixed is not None and len(system.also_fixed) > 1:
+        return False
     if method == "auto":
         one = all(weight.dim() == 0 or len(weight) == 1 for weight in system.weights.tensors)
         return one and system.matrix_entries <= SMALL_MATRIX
