@@ -345,9 +345,11 @@ _MARKUPS = json.dumps(
 
 # Tables, settings and records.
 
-_TABLE = (
-    'name,fixed,moving,settings.similarity.window,settings.optimiser.steps\na,x.nii,y.nii,5,"[3, 2]"\nb,~/x.nii,$HOME/z.nii,n/a,\n'
-)
+_TABLE = """\
+name,fixed,moving,settings.similarity.window,settings.optimiser.steps
+a,x.nii,y.nii,5,"[3, 2]"
+b,~/x.nii,$HOME/z.nii,n/a,
+"""
 _SETTINGS = """\
 similarity: {measure: lncc, window: 5}
 optimiser:

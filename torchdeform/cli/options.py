@@ -43,9 +43,7 @@ FixedPoints = Annotated[Path | None, optional_file("Landmarks (csv, elastix txt,
 MovingPoints = Annotated[Path | None, optional_file("... and the same landmarks in MOVING.")]
 FixedLabels = Annotated[Path | None, optional_file("Regions, whose overlap is measured ...")]
 MovingLabels = Annotated[Path | None, optional_file("... and the same regions of MOVING.")]
-Tissue = Annotated[
-    Path | None, optional_file("Tissue of FIXED: say what 1 is by --set tissues.1=rigid.", "LABELS")
-]
+Tissue = Annotated[Path | None, optional_file("Tissue of FIXED: say what 1 is by --set tissues.1=rigid.", "LABELS")]
 Device = Annotated[str, choice(DEVICES, "auto, cpu or cuda.")]
 Quiet = Annotated[bool, flag("--quiet", "Print errors only.")]
 Json = Annotated[bool, flag("--json", "Print one JSON record, for programs.")]

@@ -219,4 +219,4 @@ def join(apart: Tensor, sides: Tensor, grid: Grid, floor: float) -> Tensor:
             break
         around = (2**grid.dim * smoothed(folded.to(u), 1)).clamp(max=1)
         width = (width * (1 + (_WIDER - 1) * around)).clamp(max=_WIDEST)
-    return repair_folds(u, grid, floor)
+    return repair_folds(u, grid)

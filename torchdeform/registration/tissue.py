@@ -126,12 +126,12 @@ class Tissue:
             floor: smallest one-sided determinant that is wanted around what is rigid.
             held: axes along which nothing is moved.
         """
-        found = [self._fits(u, grid)]
-        u = self.exact(u, grid, floor, held)
-        found.append(self._fits(u, grid))
+        exact = self.exact(u, grid, floor, held)
+        before = self._fits(u, grid)
+        found = before, before if exact is u else self._fits(exact, grid)
         nodes = (self.shares > 0.5).flatten(2).sum(2).expand(len(u), -1)
         named = zip(self.labels, self.kinds, self.sliding, nodes.unbind(1), *found, strict=True)
-        return u, tuple(TissueOutcome(*one) for one in named)
+        return exact, tuple(TissueOutcome(*one) for one in named)
 
     def exact(self, u: Tensor, grid: Grid, floor: float, held: Sequence[int] = (), glides: bool = False) -> Tensor:
         """Return maps that keep shapes and volumes of the labels whose borders glide, or of the others.
