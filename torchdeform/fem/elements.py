@@ -74,8 +74,8 @@ def row_table(row: Row, grid: Grid, count: int, device: torch.device) -> Tensor:
     for term in row.terms:
         table = gauss_table(term.axis, grid.spacing, torch.float64, device, row.centre).unflatten(1, [-1, *ones])
         parts[term.component] = parts[term.component] + table * at_corners(term.coefficient)
-    shape = torch.broadcast_shapes(*(p.shape for p in parts))
-    return torch.cat([p.expand(shape) for p in parts], dim=2)
+    whole = torch.broadcast_tensors(*parts)  # `broadcast_shapes` would import sympy
+    return torch.cat(whole, dim=2)
 
 
 def element_matrices(form: Form, grid: Grid, device: torch.device | str = "cpu") -> Tensor:

@@ -269,8 +269,8 @@ class _CoupledModes:
 
     def _update(self, along: list[Tensor], delta: Tensor | float) -> None:
         """Add δ t tᵀ, t being ``along`` the components."""
-        shape = torch.broadcast_shapes(self.inverse[:, :1].shape, *(t.shape for t in along))
-        solved = self._solve(torch.cat([t.expand(shape) for t in along], dim=1))
+        whole = torch.broadcast_tensors(self.inverse[:, :1], *along)[1:]  # `broadcast_shapes` would import sympy
+        solved = self._solve(torch.cat(whole, dim=1))
         columns = [solved[:, k : k + 1] for k in range(len(along))]
         gain = delta / (1 + delta * reduce(torch.add, [t * h for t, h in zip(along, columns, strict=True)]))
         self.updates.append((along, columns, gain))
