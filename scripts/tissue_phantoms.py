@@ -208,7 +208,7 @@ def blocks(dim: int = 2, seed: int = 1, shape: str = "flat") -> Phantom:
     moved = [(labels == k) * (part.back(x, -1.0) - x) for k, part in enumerate(parts, start=1)]
     truth = torch.stack(moved).sum(0)
     images = _noisy(scene(x, 0.0), rng), _noisy(scene(x, 1.0), rng)
-    return Phantom(f"blocks {dim}D, {shape}", *images, labels, truth.float(), {"sliding": [1]})
+    return Phantom(f"blocks {dim}D, {shape}", *images, labels, truth.float(), {"sliding": [1, 2]})
 
 
 def breathing(dim: int = 2, seed: int = 1) -> Phantom:
