@@ -10,6 +10,9 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import MAX_POOL
 from torchdeform.errors import InputError
 
+# This share of the nodes of a label is looked at where a few do not count.
+_COUNTED = 0.999
+
 
 @dataclass(frozen=True)
 class Crop:
@@ -68,6 +71,11 @@ def require_labels(labels: Tensor, grid: Grid, name: str) -> None:
     if labels.dtype != torch.bool or labels.dim() != grid.dim + 2 or tuple(labels.shape[2:]) != grid.shape:
         want = ", ".join(["B", "L", *map(str, grid.shape)])
         raise InputError(f"{name} must be bool of shape ({want}), got {labels.dtype} of {tuple(labels.shape)}")
+
+
+def all_but_few(values: Tensor) -> Tensor:
+    """Return the largest of ``(N,)`` but for one in a thousand."""
+    return values.kthvalue(math.ceil(_COUNTED * len(values))).values
 
 
 def grown(mask: Tensor, steps: int = 1) -> Tensor:

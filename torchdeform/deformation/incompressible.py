@@ -18,11 +18,11 @@ from torchdeform.core.derivatives import add_adjoint_derivative, cofactors, dete
 from torchdeform.core.diagnostics import one_sided_determinant
 from torchdeform.core.fold_free import largest_share
 from torchdeform.core.grid import Grid, per_item
-from torchdeform.core.regions import Crop, grown, nearest, require_labels
+from torchdeform.core.regions import Crop, all_but_few, grown, nearest, require_labels
 from torchdeform.solvers.cg import conjugate_gradient, dots
 
 # Done when |det ∇φ − 1| is smaller than this at all nodes but one in a thousand.
-_TOLERANCE, _COUNTED = 2e-3, 0.999
+_TOLERANCE = 2e-3
 
 # ε of the module's docstring: less fits waves from node to node sooner, more is steadier where volumes do not fit.
 _PRICE = 0.03
@@ -137,8 +137,8 @@ class _Label:
         """Return what all nodes of the label but one in a thousand keep to, ``(B,)``."""
         found = left.new_zeros(len(left))
         for item, (values, where) in enumerate(zip(left.abs(), self.label, strict=True)):
-            if count := int(where.sum()):
-                found[item] = values[where].kthvalue(math.ceil(_COUNTED * count)).values
+            if bool(where.any()):
+                found[item] = all_but_few(values[where])
         return found
 
     def _lowest(self, u: Tensor) -> Tensor:

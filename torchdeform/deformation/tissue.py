@@ -8,13 +8,10 @@ from torch import Tensor
 
 from torchdeform.core.derivatives import jacobian_determinant
 from torchdeform.core.grid import Grid
-from torchdeform.core.regions import Crop, require_labels
+from torchdeform.core.regions import Crop, all_but_few, require_labels
 from torchdeform.deformation.rigid import fit_rigid
 from torchdeform.deformation.volumes import nodal_volumes
 from torchdeform.errors import InputError
-
-# Of the nodes of a label, this share is looked at for the determinant.
-_COUNTED = 0.999
 
 
 class LabelFit(NamedTuple):
@@ -68,5 +65,4 @@ def _fit(u: Tensor, inside: Tensor, grid: Grid) -> tuple[float, float, float]:
     away = (motion.at(points) - move) / grid.along(grid.spacing, u).flatten(2)
     off = (jacobian_determinant(u, crop.grid)[0, 0, inside] - 1).abs()
     volumes = [nodal_volumes(field, crop.grid)[0, 0, inside].sum() for field in (u, torch.zeros_like(u))]
-    worst = off.kthvalue(math.ceil(_COUNTED * len(off))).values
-    return float(away.norm(dim=1).max()), float(worst), float(volumes[0] / volumes[1])
+    return float(away.norm(dim=1).max()), float(all_but_few(off)), float(volumes[0] / volumes[1])

@@ -7,6 +7,7 @@ map goes on smoothly, and in the end every node takes that of its own side.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -24,7 +25,8 @@ from torchdeform.registration.optimise import Coupling, Objective, forward_objec
 from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.result import Callback, LevelRecord
 from torchdeform.registration.settings import RegistrationSettings
-from torchdeform.registration.tissue import Tissue
+
+Given = TypeVar("Given")
 
 # How often a border is smoothed to see its direction: some 2 voxels wide.
 _ROUNDS = 4
@@ -53,21 +55,21 @@ def optimise_sides(
     several = _by_sides(problem, sides)
     begun = None if start is None else start.repeat(count, *[1] * (start.dim() - 1))
     u, records = optimise_levels(several, settings, begun, shown, _objective)
-    u = _tissue(several).exact(u, problem.grid, settings.folds.min_determinant, problem.held, glides=True)
+    u = _given(several.tissue).exact(u, problem.grid, settings.folds.min_determinant, problem.held, glides=True)
     joined = join(u.unflatten(0, (count, items)).transpose(0, 1), sides, problem.grid, settings.folds.min_determinant)
     return joined, tuple(replace(one, similarity=tuple(v[:items] for v in one.similarity)) for one in records)
 
 
 def _sides(problem: RegistrationProblem) -> Tensor:
     """Return how much of each node belongs to each side ``(B or 1, K, *S)``: to labels that glide, and to the rest."""
-    own = _tissue(problem).gliding
+    own = _given(problem.tissue).gliding
     return torch.cat([own, 1 - own.sum(1, keepdim=True).clamp(max=1)], dim=1)
 
 
-def _tissue(problem: RegistrationProblem) -> Tissue:
-    if problem.tissue is None:
+def _given(part: Given | None) -> Given:
+    if part is None:
         raise InputError("sliding needs labels: give annotations.tissue")
-    return problem.tissue
+    return part
 
 
 def _by_sides(problem: RegistrationProblem, sides: Tensor) -> RegistrationProblem:
@@ -79,7 +81,7 @@ def _by_sides(problem: RegistrationProblem, sides: Tensor) -> RegistrationProble
 
     names = ("fixed", "moving", "moving_mask", "fixed_points", "moving_points")
     masks = sides.expand(items, *sides.shape[1:]).transpose(0, 1).flatten(0, 1).unsqueeze(1)
-    tissue = _tissue(problem)
+    tissue = _given(problem.tissue)
     # A label is there in the map of its own side alone: what it holds there does not reach beyond the border.
     shares = tissue.shares.expand(items, *tissue.shares.shape[1:]).repeat(count, *[1] * (tissue.shares.dim() - 1))
     tissue = replace(tissue, shares=shares * (masks > 0.5))
@@ -95,7 +97,7 @@ def _by_sides(problem: RegistrationProblem, sides: Tensor) -> RegistrationProble
 def _objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
     """Return what is maximised where every side has a map: the similarity of all sides, each by its size."""
     alone = forward_objective(problem, grid, settings)
-    sides = restrict(_required(problem.sides), problem.grid, grid)
+    sides = restrict(_given(problem.sides), problem.grid, grid)
     count = sides.shape[1]
     size = alone.similarity.fixed_mask.flatten(1).mean(1)
     similarity = _OfAllSides(alone.similarity.similarity, size.unflatten(0, (count, -1)))
@@ -103,17 +105,11 @@ def _objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationS
     return Objective(term, alone.landmarks and _landmarks(problem, grid), Gliding(sides, grid, problem.held))
 
 
-def _required(sides: Tensor | None) -> Tensor:
-    if sides is None:
-        raise InputError("sliding needs labels: give annotations.tissue")
-    return sides
-
-
 def _landmarks(problem: RegistrationProblem, grid: Grid) -> ForwardLandmarks | None:
     """Return the landmarks, each of which counts in the map of the side that it lies on."""
     if problem.pairs is None:
         return None
-    sides, (fixed, moving) = _required(problem.sides), problem.pairs
+    sides, (fixed, moving) = _given(problem.sides), problem.pairs
     count = sides.shape[1]
     shares = sample(sides, fixed[: len(fixed) // count], problem.grid)  # (B, K, n)
     belongs = one_hot(shares.argmax(1), count).to(fixed).permute(2, 0, 1).flatten(0, 1).unsqueeze(1)

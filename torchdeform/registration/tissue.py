@@ -109,11 +109,9 @@ class Tissue:
 
         Each node is in one label at most.
         """
-        both = zip(self.kinds, self.sliding, strict=True)
-        return (
-            self.shares[:, [k for k, (one, slides) in enumerate(both) if one == kind and glides in (None, slides)]]
-            > 0.5
-        )
+        both = enumerate(zip(self.kinds, self.sliding, strict=True))
+        wanted = [k for k, (one, slides) in both if one == kind and glides in (None, slides)]
+        return self.shares[:, wanted] > 0.5
 
     def corrected(
         self, u: Tensor, grid: Grid, floor: float, held: Sequence[int] = ()
@@ -138,32 +136,18 @@ class Tissue:
 
         A label with a border that glides is corrected in the map of its side, before the sides are joined.
         """
-        rigid = self.masks("rigid", glides)
-        u = self._rigid(u, rigid, grid, floor)
-        u = hold_volume(u, self.masks("incompressible", glides), grid, still=rigid)
+        u = _held_rigid(u, self.hold(grid, glides), grid, floor)
+        u = hold_volume(u, self.masks("incompressible", glides), grid, still=self.masks("rigid", glides))
         if held:
             u = repair_folds(u.index_fill(1, torch.tensor(held, device=u.device), 0.0), grid)
         return repair_folds(u, grid)  # where two labels that turn leave no room between them
 
-    @staticmethod
-    def _rigid(u: Tensor, masks: Tensor, grid: Grid, floor: float) -> Tensor:
-        """Return maps without folds that are rigid on the labels, or nearly where that folds what is around."""
-        if not bool(masks.any()):
-            return u
-        hold = RigidHold(masks, grid)
-        for _ in range(_ROUNDS):
-            held = hold(u, floor)
-            u = repair_folds(held, grid)
-            if u is held:
-                break
-        return u
-
     def _fits(self, u: Tensor, grid: Grid) -> list[TissueFit]:
         return [TissueFit(*label_fit(u, label, grid)) for label in (self.shares > 0.5).split(1, dim=1)]
 
-    def hold(self, grid: Grid) -> RigidHold | None:
-        """Return what keeps the rigid labels rigid, None where there are none."""
-        masks = self.masks("rigid")
+    def hold(self, grid: Grid, glides: bool | None = None) -> RigidHold | None:
+        """Return what keeps the rigid labels rigid, see `masks`; None where there are none."""
+        masks = self.masks("rigid", glides)
         return RigidHold(masks, grid) if bool(masks.any()) else None
 
     def weights(self, base: Weights) -> Weights:
@@ -183,3 +167,15 @@ class Tissue:
         """The share of each node ``(B or 1, 1, *S)`` that no price holds."""
         held = [k for k, price in enumerate(self.prices) if price]
         return 1 - self.shares[:, held].sum(1, keepdim=True).clamp(max=1)
+
+
+def _held_rigid(u: Tensor, hold: RigidHold | None, grid: Grid, floor: float) -> Tensor:
+    """Return maps without folds that are rigid on the rigid labels, or nearly where that folds what is around."""
+    if hold is None:
+        return u
+    for _ in range(_ROUNDS):
+        held = hold(u, floor)
+        u = repair_folds(held, grid)
+        if u is held:
+            break
+    return u
