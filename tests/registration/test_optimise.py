@@ -21,12 +21,13 @@ from torchdeform.registration.tissue import Tissue
 from torchdeform.registration.velocity import VelocityMetric
 
 
-def test_only_large_levels_carry_a_coarser_map(monkeypatch):
+def test_only_a_large_finest_level_carries_a_coarser_map(monkeypatch):
     settings = settings_of(map_spacing=2.0)
     grid = Grid((40, 48))
-    assert levels._map_grid(grid, settings) == grid
+    assert levels._map_grid(grid, settings, 0) == grid
     monkeypatch.setattr(levels, "_LARGE", math.prod(grid.shape) - 1)
-    assert levels._map_grid(grid, settings) == coarsened(grid, 2.0)
+    assert levels._map_grid(grid, settings, 0) == coarsened(grid, 2.0)
+    assert levels._map_grid(grid, settings, 1) == grid
 
 
 @pytest.mark.parametrize("symmetric", [False, True])

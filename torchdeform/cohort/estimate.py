@@ -13,7 +13,6 @@ from torchdeform.errors import InputError, explain
 from torchdeform.io.gate import DAMAGED
 from torchdeform.io.images import image_size
 from torchdeform.pipeline.memory import choices, fitting_grid, footprint
-from torchdeform.registration.optimise import steps_on
 
 # Seconds of one core of an x86 server: of a pair, whatever its size; and per node, step and channel with
 # LNCC, by dimension; `Measure.time` has the others beside it.
@@ -76,7 +75,7 @@ def _seconds(job: Job, size: Size) -> float | None:
     steps = settings.optimiser.steps
     levels = pyramid_grids(grid, len(steps))
     steps = steps[len(steps) - len(levels) :]
-    node_steps = sum(math.prod(g.shape) * steps_on(g, n, settings) for g, n in zip(levels, steps, strict=True))
+    node_steps = sum(math.prod(g.shape) * n for g, n in zip(levels, steps, strict=True))
     maps = (2 if symmetric else 1) + len(set(settings.sliding))
     fields = maps * channels * sum(measure.time for measure in measures.values())
     return _PAIR + fields * _PER_NODE_STEP[grid.dim] * node_steps

@@ -12,7 +12,7 @@ from torchdeform.core.warp import warp
 from torchdeform.errors import require_choice, require_ranges
 from torchdeform.metrics.similarity import INTENSITIES, MEASURES
 from torchdeform.nn.precision import full_precision
-from torchdeform.registration.optimise import Level, Objective, optimise_level
+from torchdeform.registration.optimise import Level, Objective, elasticity_of, optimise_level
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.velocity import VelocityMetric
 
@@ -72,6 +72,7 @@ class DeformableRegistration(nn.Module):
             metric=VelocityMetric.of(self.grid, self.settings.metric, self.settings.solver, fixed),
             settings=self.settings,
             steps=self.steps,
+            elasticity=elasticity_of(self.settings.metric, len(u)),
             keep_best=False,
         )
         return optimise_level(level, u, run=partial(checkpoint, use_reentrant=False)).u

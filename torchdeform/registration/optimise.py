@@ -14,22 +14,27 @@ from torchdeform.core.diagnostics import one_sided_determinant
 from torchdeform.core.flow import flow
 from torchdeform.core.fold_free import largest_share, repair_folds, smooth_elastically, where_items
 from torchdeform.core.grid import Grid, limit_threads, per_item
+from torchdeform.core.regions import grown
 from torchdeform.core.resampling import Transfer, coarsened, prolong, pyramid_grids
 from torchdeform.core.warp import compose, warp
 from torchdeform.deformation.rigid import RigidHold
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity, weighted
+from torchdeform.metrics.correlation import window_mean
+from torchdeform.metrics.noise import Noise
 from torchdeform.metrics.similarity import features, make_similarity
 from torchdeform.registration.landmarks import ForwardLandmarks, Landmarks
 from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.result import Callback, LevelRecord, Progress
-from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.settings import MetricSettings, RegistrationSettings
 from torchdeform.registration.tissue import Tissue
 from torchdeform.registration.velocity import (
     LAST_STEP,
     VelocityMetric,
+    evened,
     fold_barrier,
     image_force,
+    limited_step,
     normalise_step,
     step_size,
 )
@@ -37,9 +42,20 @@ from torchdeform.registration.velocity import (
 # Steps over which a level must have gained, see `OptimiserSettings.tolerance`.
 _PATIENCE = 5
 
-# Levels whose images have more nodes than this carry the map on the coarser grid of `OptimiserSettings.map_spacing`.
-# Mouse brains (10^6 nodes) gain 0.003 Dice and half of the time by it; slices and hippocampi (7·10^4) would lose 0.01.
+# Finest levels whose images have more nodes than this carry the map on the coarser grid of
+# `OptimiserSettings.map_spacing`. Mouse brains (10^6 nodes) gain 0.003 Dice and half of the time by it; slices and
+# hippocampi (7·10^4) would lose 0.01.
 _LARGE = 2**17
+
+# A step that made the images less similar makes all that follow so many times as long.
+_SHORTER = 0.85
+
+# ``elasticity: auto`` is this where noise is not known, else so much without noise, more with its share, and at most
+# so much.
+_ELASTICITY, _CALM, _PER_NOISE, _MOST_ELASTIC = 0.2, 0.1, 3.0, 0.4
+
+# A step that would fold is shortened around the folds first: so often, by this share, within so many nodes.
+_LOCAL_TRIES, _CUT, _WITHIN = 4, 0.7, 4
 
 # A similarity that is higher by a smaller share of itself is not higher: its last bits depend on the sums.
 _ROUNDING = 1e-6
@@ -126,7 +142,8 @@ def forward_similarity(problem: RegistrationProblem, settings: RegistrationSetti
     """Return the similarity of the fixed and the warped moving image."""
     measure, window = settings.similarity.measure, settings.similarity.window
     fixed, moving = (features(measure, image) for image in (problem.fixed, problem.moving))
-    similarity = make_similarity(measure, fixed, window, grid=problem.grid)
+    noise = problem.noise and problem.noise.variance
+    similarity = make_similarity(measure, fixed, window, grid=problem.grid, noise=noise)
     return SimilarityTerm(problem.grid, moving, similarity, problem.moving_mask, problem.fixed_mask)
 
 
@@ -160,6 +177,7 @@ class Level:
         steps: steps at most.
         index: its number, 0 is the coarsest.
         levels: how many there are.
+        elasticity: smoothing of each map in a step, a number or one for each ``(B,)``.
         transfer: between the grid of the images and that of the map, None where they are one.
         keep_best: end at the best map that was met, and stop where nothing is gained; otherwise make all steps.
         held: axes along which nothing is moved, from 0.
@@ -173,6 +191,7 @@ class Level:
     steps: int
     index: int = 0
     levels: int = 1
+    elasticity: float | Tensor = _ELASTICITY
     transfer: Transfer | None = None
     keep_best: bool = True
     held: tuple[int, ...] = ()
@@ -214,6 +233,7 @@ class State:
         best_values: what was maximised at its best so far, after each step.
         shortened: steps that were shortened because they would have folded, summed over the batch.
         ascent: of the last step, as the solver left it, where tissue varies.
+        pace: share of its length that a step of each map still has ``(B,)``.
     """
 
     u: Tensor
@@ -225,6 +245,7 @@ class State:
     best_values: tuple[Tensor, ...] = ()
     shortened: int = 0
     ascent: Tensor | None = None
+    pace: float | Tensor = 1.0
 
 
 def forward_objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
@@ -273,15 +294,18 @@ def make_level(
     levels: int,
 ) -> Level:
     """Return level ``index`` of so many, from the problem on its grid."""
-    grid, below = _map_grid(problem.grid, settings), levels - 1 - index
+    below = levels - 1 - index
+    grid = _map_grid(problem.grid, settings, below)
     tissue = problem.tissue and problem.tissue.on(problem.grid, grid)
+    goal = objective(problem, grid, settings)
     return Level(
-        objective=objective(problem, grid, settings),
+        objective=goal,
         metric=VelocityMetric.of(grid, settings.metric, settings.solver, problem.fixed, below, tissue),
         settings=settings,
-        steps=steps_on(problem.grid, settings.optimiser.steps[index - levels], settings),
+        steps=settings.optimiser.steps[index - levels],
         index=index,
         levels=levels,
+        elasticity=elasticity_of(settings.metric, len(goal.similarity.images), problem.noise),
         transfer=Transfer(problem.grid, grid, problem.fixed) if grid != problem.grid else None,
         held=problem.held,
         tissue=tissue,
@@ -289,14 +313,20 @@ def make_level(
     )
 
 
-def steps_on(grid: Grid, steps: int, settings: RegistrationSettings) -> int:
-    """Return the steps of a level of images on this grid: a coarser map is found map_spacing² times as soon."""
-    return steps if _map_grid(grid, settings) == grid else math.ceil(steps / settings.optimiser.map_spacing**2)
+def _map_grid(grid: Grid, settings: RegistrationSettings, below: int) -> Grid:
+    """Return the grid that carries the map of images on ``grid``, with so many finer levels below."""
+    large = below == 0 and math.prod(grid.shape) > _LARGE
+    return coarsened(grid, settings.optimiser.map_spacing) if large else grid
 
 
-def _map_grid(grid: Grid, settings: RegistrationSettings) -> Grid:
-    """Return the grid that carries the map of images on ``grid``."""
-    return coarsened(grid, settings.optimiser.map_spacing) if math.prod(grid.shape) > _LARGE else grid
+def elasticity_of(settings: MetricSettings, maps: int, noise: Noise | None = None) -> float | Tensor:
+    """Return the elasticity of all maps, or of each of so many ``(maps,)`` by the noise of its images."""
+    if not isinstance(settings.elasticity, str):
+        return settings.elasticity
+    if noise is None:
+        return _ELASTICITY
+    share = noise.share.repeat(maps // len(noise.share))
+    return (_CALM + _PER_NOISE * share).clamp(max=_MOST_ELASTIC)
 
 
 def optimise_level(
@@ -311,7 +341,7 @@ def optimise_level(
         run: calls a function with its arguments; anything that does that, such as torch's ``checkpoint``.
     """
     active = torch.ones(len(u), dtype=torch.bool, device=u.device)
-    state = State(u, one_sided_determinant(u, level.grid), torch.zeros_like(u), active, u)
+    state = State(u, one_sided_determinant(u, level.grid), torch.zeros_like(u), active, u, pace=u.new_ones(len(u)))
     for step in range(level.steps + level.keep_best):
         state, finished = run(_step, level, state, step) if run else _step(level, state, step)
         if callback:
@@ -361,6 +391,9 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     force = image_force(slope, warped, objective.similarity.grid, settings.stencil)
     del warped, slope  # before the next are made
     force = force if level.transfer is None else level.transfer.gather(force)
+    even, limit = settings.optimiser.evenness, settings.optimiser.limit
+    whole = level.tissue is not None  # what is rigid turns as a whole
+    force = force if even is None or whole else evened(force, even)
     scale = settings.points_weight * math.prod(grid.shape)  # to the unit of N ∂S/∂warped
     load = None if points is None else points.load(grid) * scale
     # 3. Least squares: div and curl of the velocity are paid for, nearly folded places ask for divergence.
@@ -371,9 +404,13 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     v = held_still(ascent, level.held)
     v = normalise_step(coupling.velocity(v), grid, coupling.together)
     direction = v + settings.optimiser.momentum * state.direction
-    v = normalise_step(direction, grid, coupling.together)
+    if limit is None or whole:
+        v = normalise_step(direction, grid, coupling.together)
+    else:
+        v = limited_step(direction, grid, limit, coupling.together)
     # 4. and 5. Flow and guard: φ ← φ ∘ flow(v), no farther than where a determinant becomes too small.
-    size = v.new_full((len(v),), step_size(settings.optimiser, step, level.steps))
+    voxel = min(objective.similarity.grid.spacing) / min(grid.spacing)
+    size = v.new_full((len(v),), voxel * step_size(settings.optimiser, step, level.steps)) * state.pace
     if points is not None:
         size = points.line_search(v, grid).clamp(min=LAST_STEP * size, max=size)
     moved, u, lowest = fold_free_step(level, state, v * per_item(size * state.active, v))
@@ -394,31 +431,43 @@ def held_still(field: Tensor, axes: Sequence[int]) -> Tensor:
 def fold_free_step(level: Level, state: State, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return which share of the step every map made, u ∘ flow(share v) smoothed elastically, and its determinants.
 
-    No one-sided determinant falls below ``min_determinant``, or below the smallest one there was if that was less. As
-    the step is halved the trial tends to u, so a bold step ends as a short one. The extrapolated determinants on the
+    No one-sided determinant falls below ``min_determinant``, or below the smallest one there was if that was less. The
+    step is shortened around the nodes where one would, so that a few of them do not hold back all others; where that is
+    not enough it is halved as a whole, and as the trial then tends to u, a bold step ends as a short one. The extrapolated determinants on the
     faces of the box are left to `repair_folds`, after the last step: they take as long as all the others and hardly
     ever fold alone.
     """
-    settings, grid = level.settings, level.grid
-    floor = state.lowest.flatten(1).amin(1).clamp(max=settings.folds.min_determinant)
+    coupling = level.objective.coupling
+    floor = state.lowest.flatten(1).amin(1).clamp(max=level.settings.folds.min_determinant)
     u, lowest = state.u, state.lowest
-    free = None if level.tissue is None else level.tissue.free
 
     def accept(share: Tensor) -> Tensor:
         nonlocal u, lowest
-        u = compose(state.u, flow(v * per_item(share, v), grid, settings.flow), grid)
-        if settings.metric.elasticity > 0:
-            moved = per_item(settings.metric.elasticity * share * state.active, u)
-            u = smooth_elastically(u, moved if free is None else moved * free, grid)
-        u = level.objective.coupling.extended(u)
-        if level.hold is not None:
-            u = level.hold(u, floor)
-        lowest = level.objective.coupling.counted(one_sided_determinant(u, grid))
-        return level.objective.coupling.all(lowest.flatten(1).amin(1) >= floor)
+        u, lowest = _moved(level, state, around * per_item(share, v) * v, share, floor)
+        return coupling.all(lowest.flatten(1).amin(1) >= floor)
 
+    around, whole = torch.ones_like(v[:, :1]), torch.ones_like(floor)
+    for _ in range(_LOCAL_TRIES if level.tissue is None else 0):
+        u, lowest = _moved(level, state, around * v, whole, floor)
+        folded = ~coupling.all(lowest >= per_item(floor, lowest))
+        if not bool(folded.any()):
+            return around.flatten(1).amin(1), u, lowest
+        around = around * (1 - _CUT * window_mean(grown(folded, _WITHIN).to(v), 2 * _WITHIN + 1))
     share = largest_share(accept, floor, halvings=_HALVINGS)
     good = share > 0
-    return share, where_items(good, u, state.u), where_items(good, lowest, state.lowest)
+    return share * around.flatten(1).amin(1), where_items(good, u, state.u), where_items(good, lowest, state.lowest)
+
+
+def _moved(level: Level, state: State, v: Tensor, share: Tensor, floor: Tensor) -> tuple[Tensor, Tensor]:
+    """Return u ∘ flow(v), smoothed elastically by a share ``(B,)`` and held, and its one-sided determinants."""
+    grid, coupling = level.grid, level.objective.coupling
+    u = compose(state.u, flow(v, grid, level.settings.flow), grid)
+    if level.settings.metric.elasticity != 0:
+        smoothing = per_item(level.elasticity * share * state.active, u)
+        u = smooth_elastically(u, smoothing if level.tissue is None else smoothing * level.tissue.free, grid)
+    u = coupling.extended(u)
+    u = u if level.hold is None else level.hold(u, floor)
+    return u, coupling.counted(one_sided_determinant(u, grid))
 
 
 def _judged(level: Level, state: State, value: Tensor, distance: Tensor | None) -> State:
@@ -431,7 +480,8 @@ def _judged(level: Level, state: State, value: Tensor, distance: Tensor | None) 
     best, top = where_items(better, state.u, state.best), where_items(better, goal, top)
     best_values = (*state.best_values, top)
     active = state.active & ~_stalled(best_values, level.settings.optimiser.tolerance)
-    return replace(state, best=best, values=(*state.values, value), best_values=best_values, active=active)
+    pace = torch.where(better, state.pace, _SHORTER * state.pace)
+    return replace(state, best=best, values=(*state.values, value), best_values=best_values, active=active, pace=pace)
 
 
 def _stalled(best_values: tuple[Tensor, ...], tolerance: float) -> Tensor:

@@ -16,6 +16,7 @@ from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import weighted
 from torchdeform.metrics.correlation import lncc
+from torchdeform.metrics.noise import Noise, noise_of
 from torchdeform.metrics.similarity import needs_common_scale
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.tissue import Tissue
@@ -123,6 +124,7 @@ class RegistrationProblem:
         tissue: what the fixed image is made of, None where nothing is said.
         sides: how much of each node belongs to each side of borders that glide ``(B or 1, K, *S)``, where the pairs are
             those of every side and item; None without.
+        noise: of the noisier image of each pair; None before the images are on their scale.
     """
 
     grid: Grid
@@ -135,6 +137,7 @@ class RegistrationProblem:
     held: tuple[int, ...] = ()
     tissue: Tissue | None = None
     sides: Tensor | None = None
+    noise: Noise | None = None
 
     @property
     def pairs(self) -> tuple[Tensor, Tensor] | None:
@@ -166,7 +169,8 @@ class RegistrationProblem:
             (self.fixed_mask, self.moving_mask),
             jointly=needs_common_scale(settings.similarity.measure),
         )
-        return replace(self, fixed=images[0], moving=images[1])
+        noise = noise_of(images[0], self.fixed_mask).larger(noise_of(images[1], self.moving_mask))
+        return replace(self, fixed=images[0], moving=images[1], noise=noise)
 
 
 def problem_of_tensors(fixed: Tensor, moving: Tensor, grid: Grid, annotations: Annotations) -> RegistrationProblem:

@@ -64,7 +64,7 @@ class MetricSettings:
             not named.
         order: 1, or 2 for a smoother velocity (K M⁻¹ K in place of K).
         elasticity: smoothing of the map in each step, 0 none, 1 full: the share of the way to the mean of its
-            neighbours that every node is moved.
+            neighbours that every node is moved. ``auto``: from 0.1 for images without noise to 0.4 for noisy ones.
 
     Raises:
         InputError: a value out of range, named.
@@ -74,14 +74,16 @@ class MetricSettings:
     weight_curl: float = 1.0
     length_scale: float | tuple[float, ...] = (8.0, 5.0, 2.5)
     order: int = 1
-    elasticity: float = 0.2
+    elasticity: float | str = AUTO
 
     def __post_init__(self) -> None:
         require_choice(self.order, (1, 2), "metric.order")
         lengths = (RANGES["positive"][0], f"{RANGES['positive'][1]}, one number or one for each level")
-        require_ranges(
-            self, "metric.", length_scale=lengths, weight_div="positive", weight_curl="positive", elasticity="0 to 1"
-        )
+        require_ranges(self, "metric.", length_scale=lengths, weight_div="positive", weight_curl="positive")
+        if isinstance(self.elasticity, str):
+            require_choice(self.elasticity, (AUTO,), "metric.elasticity, if it is no number,")
+        else:
+            require_ranges(self, "metric.", elasticity="0 to 1")
 
     @property
     def _lengths(self) -> tuple[float, ...]:
@@ -99,19 +101,26 @@ class OptimiserSettings:
     Args:
         steps: steps at most on each pyramid level, coarse to fine; its length is the number of levels (a level that
             would leave fewer than 16 nodes on every axis is dropped).
-        step_length: longest move in one step, in voxels of the map; falls linearly to a tenth of this over a level.
+        step_length: longest move in one step, in voxels of the level's images; falls linearly to a tenth of this over a
+            level, and to 0.85 of itself with every step that made the images less similar.
+        limit: moves longer than this many typical ones, √(Σ|v|⁴ / Σ|v|²), are cut to that, which is then the longest
+            move; ``null``: none is cut.
+        evenness: the force at a node is divided by its strength around it and this share of the typical strength: small
+            moves what is weak as far as what is strong; ``null``: the force is taken as it is.
         momentum: at least 0 and below 1; the direction of a step is Σ_k momentumᵏ v_k of the velocities so far, the
             newest being v_0. What they agree on is reached sooner, what they take back from each other cancels.
         tolerance: a level stops when 5 steps raised the best similarity by less than this share of its rise so far.
-        map_spacing: spacing of the grid that carries the map, in voxels of the level's images, on levels of more than
-            2^17 voxels, which take map_spacing² times fewer steps; smaller ones carry it at every voxel.
+        map_spacing: spacing of the grid that carries the map on the finest level, in voxels of the images, where these
+            have more than 2^17; else, and on other levels, every voxel carries it.
 
     Raises:
         InputError: a value out of range, named.
     """
 
-    steps: tuple[int, ...] = (40, 30, 24)
-    step_length: float = 1.0
+    steps: tuple[int, ...] = (40, 40, 16)
+    step_length: float = 0.8
+    limit: float | None = 1.5
+    evenness: float | None = 0.1
     momentum: float = 0.5
     tolerance: float = 0.03
     map_spacing: float = 2.0
@@ -125,6 +134,7 @@ class OptimiserSettings:
             momentum="below 1",
             tolerance="finite, not negative",
             map_spacing=(lambda spacing: 1 <= spacing <= 8, "lie between 1 and 8 voxels"),
+            **{name: "positive" for name in ("limit", "evenness") if getattr(self, name) is not None},
         )
 
 

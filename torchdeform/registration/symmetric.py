@@ -104,7 +104,8 @@ def symmetric_objective(problem: RegistrationProblem, grid: Grid, settings: Regi
     if problem.fixed_mask is not None or problem.moving_mask is not None:
         ones = torch.ones_like(problem.fixed[:, :1])
         masks = torch.cat([ones if mask is None else mask for mask in (problem.fixed_mask, problem.moving_mask)])
-    term = SimilarityTerm(problem.grid, images, _MutualSimilarity(settings.similarity, problem.grid), masks)
+    noise = problem.noise and problem.noise.variance
+    term = SimilarityTerm(problem.grid, images, _MutualSimilarity(settings.similarity, problem.grid, noise), masks)
     pairs = problem.pairs if settings.points_weight > 0 else None
     return Objective(term, pairs and MidspaceLandmarks(*pairs, grid), _Opposed())
 
@@ -127,12 +128,13 @@ class _MutualSimilarity(Similarity):
     places, except the places.
     """
 
-    def __init__(self, settings: SimilaritySettings, grid: Grid) -> None:
-        self.settings, self.grid = settings, grid
+    def __init__(self, settings: SimilaritySettings, grid: Grid, noise: Tensor | None) -> None:
+        self.settings, self.grid, self.noise = settings, grid, noise
 
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         others = of_other_map(warped)
-        similarity = make_similarity(self.settings.measure, others, self.settings.window, grid=self.grid)
+        measure, window = self.settings.measure, self.settings.window
+        similarity = make_similarity(measure, others, window, grid=self.grid, noise=self.noise)
         value, slope = similarity.evaluate(warped, None if mask is None else mask * of_other_map(mask))
         return (value + of_other_map(value)) / 2, slope
 

@@ -11,6 +11,7 @@ from torchdeform.core.grid import Grid, per_item
 from torchdeform.fem.solver import SolverSettings, solver_of
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
+from torchdeform.metrics.correlation import window_mean
 from torchdeform.registration.settings import MetricSettings, OptimiserSettings
 from torchdeform.registration.tissue import Tissue
 from torchdeform.solvers.base import Factor
@@ -23,6 +24,9 @@ _RTOL = 0.1
 
 # Weight of the divergence that opens up nearly folded places, against a force of 1 at its strongest.
 _BARRIER_WEIGHT = 3.0
+
+# Width in nodes of the windows in which the strength of a force is taken.
+_AROUND = 9
 
 
 def _alone(sizes: Tensor) -> Tensor:
@@ -133,6 +137,37 @@ def normalise_step(v: Tensor, grid: Grid, together: Callable[[Tensor], Tensor] =
     """Return the velocity ``(B, D, *S)`` on the scale on which its longest move is one voxel; 0 stays 0."""
     longest = together(max_norm(v / grid.along(grid.spacing, v)))
     return v / per_item(longest.clamp(min=torch.finfo(v.dtype).tiny), v)
+
+
+def limited_step(v: Tensor, grid: Grid, limit: float, together: Callable[[Tensor], Tensor] = _alone) -> Tensor:
+    """Return the velocity ``(B, D, *S)`` scaled so that ``limit`` typical moves are one voxel, longer ones cut to that.
+
+    The longest move of all is often that of a few nodes, many times as long as others; a step that is a multiple of
+    the velocity would leave all the others nearly where they are.
+    """
+    moves = (v / grid.along(grid.spacing, v)).square().sum(1, keepdim=True).sqrt()
+    longest = together((limit * _typical(moves)).clamp(min=torch.finfo(v.dtype).tiny))
+    return v / moves.maximum(per_item(longest, v))
+
+
+def evened(force: Tensor, share: float) -> Tensor:
+    """Return the force ``(B, D, *S)`` divided by its strength in the window around each node.
+
+    Strength r is the root mean square in the window, R the `_typical` one: the factor is (1 + share) R / (r + share R),
+    1 where the strength is the typical one. The direction stays, so a step still leads uphill at every node.
+    """
+    square = force.square().sum(1, keepdim=True)
+    around, typical = window_mean(square, _AROUND).sqrt(), per_item(_typical(square.sqrt()), square)
+    least = torch.finfo(force.dtype).tiny
+    return force * ((1 + share) * typical / (around + share * typical).clamp(min=least))
+
+
+def _typical(sizes: Tensor) -> Tensor:
+    """Return √(Σ s⁴ / Σ s²) of the sizes ``(B, 1, *S)`` of each item ``(B,)``: what is 0 does not count."""
+    square = (sizes / per_item(sizes.flatten(1).amax(1).clamp(min=torch.finfo(sizes.dtype).tiny), sizes)).square()
+    square = square.flatten(1)
+    share = square.square().sum(1) / square.sum(1).clamp(min=torch.finfo(sizes.dtype).tiny)
+    return share.sqrt() * sizes.flatten(1).amax(1)
 
 
 def max_norm(field: Tensor) -> Tensor:
