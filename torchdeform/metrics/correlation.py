@@ -6,8 +6,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchdeform.core.grid import per_item
-from torchdeform.core.resampling import box_sum, box_sum_transpose, centres
+from torchdeform.core.grid import over_slabs, per_item
+from torchdeform.core.resampling import box_sum, box_sum_by_rows, box_sum_transpose, centres, least_rows
 from torchdeform.metrics.base import (
     IntensityRange,
     Similarity,
@@ -152,8 +152,12 @@ class LocalCrossCorrelation(Similarity):
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         warped = at_least_float32(warped)
         windows = self._windows(mask, warped)
-        sums = box_sum(_products(warped, self.fixed, windows.weight), self.window, self.stride)
-        sums.mul_(windows.inverse_count)
+        shape = tuple(warped.shape[2:])
+
+        def products(rows: slice) -> Tensor:
+            return _products(*(t if t is None else t[:, :, rows] for t in (warped, self.fixed, windows.weight)))
+
+        sums = box_sum_by_rows(products, shape, warped, self.window, self.stride).mul_(windows.inverse_count)
         warped_mean, square, product = sums.chunk(3, dim=1)
         covariance = _raised(product.addcmul_(warped_mean, windows.mean, value=-1))
         variance = square.addcmul_(warped_mean, warped_mean, value=-1).clamp_(min=0).add_(LNCC_FLOOR)
@@ -162,9 +166,14 @@ class LocalCrossCorrelation(Similarity):
         a = correlation.mul_(windows.inverse_count * (2 * warped[0, 0].numel() / correlation[0, 0].numel()))
         b = a * covariance / variance
         back = torch.cat([a, b, b * warped_mean - a * windows.mean], dim=1)
-        a, b, rest = box_sum_transpose(back, self.window, self.stride, tuple(warped.shape[2:])).chunk(3, dim=1)
-        slope = torch.addcmul(rest, self.fixed, a).addcmul_(warped, b, value=-1)
-        return value, slope if windows.weight is None else slope.mul_(windows.weight)
+        backs = box_sum_transpose(back, self.window, self.stride, shape)
+
+        def slope(rows: slice) -> Tensor:
+            a, b, rest = backs(rows).chunk(3, dim=1)
+            part = rest.addcmul(self.fixed[:, :, rows], a).addcmul_(warped[:, :, rows], b, value=-1)
+            return part if windows.weight is None else part.mul_(windows.weight[:, :, rows])
+
+        return value, over_slabs(slope, shape, warped.device, least=least_rows(shape))
 
 
 def lncc(

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from time import perf_counter
 from typing import Any
 
@@ -15,7 +15,7 @@ from torchdeform.core.flow import flow
 from torchdeform.core.fold_free import largest_share, repair_folds, smooth_elastically, where_items
 from torchdeform.core.grid import Grid, limit_threads, per_item
 from torchdeform.core.resampling import Transfer, coarsened, prolong, pyramid_grids
-from torchdeform.core.warp import compose, warp
+from torchdeform.core.warp import compose, warp, warp_by_rows
 from torchdeform.deformation.rigid import RigidHold
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity, weighted
@@ -93,14 +93,19 @@ class SimilarityTerm:
     masks: Tensor | None = None
     fixed_mask: Tensor | None = None
 
-    def evaluate(self, u: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the images warped by u ``(B, D, *S)``, as they are when None, S of each, and N ∂S/∂warped."""
-        warped = self._masked if u is None else warp(self._masked, u, self.grid)
-        del u  # where a coarser grid carries the map, nobody else holds it
+    def evaluate(self, u: Tensor | None = None, transfer: Transfer | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the images warped by u ``(B, D, *S)``, as they are when None, S of each, and N ∂S/∂warped.
+
+        With ``transfer`` the displacement is on a coarser grid.
+        """
+        warped = self._masked if u is None else self._warped(self._masked, u, transfer)
         if self.masks is None:
             return warped, *self.similarity.evaluate(warped, self.fixed_mask)
         warped, mask = warped.tensor_split([-1], dim=1)
         return warped, *self.similarity.evaluate(warped.contiguous(), weighted(mask, self.fixed_mask))
+
+    def _warped(self, images: Tensor, u: Tensor, transfer: Transfer | None) -> Tensor:
+        return warp(images, u, self.grid) if transfer is None else warp_by_rows(images, transfer.rows(u), self.grid)
 
     def on_common_voxels(self, maps: Sequence[Tensor]) -> list[Tensor]:
         """Return S of the images warped by each of the maps ``(B, D, *S)``, over the voxels that all of them see."""
@@ -192,6 +197,11 @@ class Level:
     def at_images(self, u: Tensor) -> Tensor:
         """Return the maps ``(B, D, *S)`` on the grid of the images."""
         return u if self.transfer is None else self.transfer.up(u)
+
+    def force(self, slope: Tensor, warped: Tensor) -> Tensor:
+        """Return the `image_force` on the grid of the map."""
+        force = partial(image_force, slope, warped, self.objective.similarity.grid, self.settings.stencil)
+        return force() if self.transfer is None else self.transfer.gather(force)
 
     @property
     def zero(self) -> Tensor:
@@ -350,17 +360,14 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     """Return the state after one step, and whether it was the last."""
     settings, objective, grid = level.settings, level.objective, level.grid
     # 1. Evaluate: warp the images, compare them, and see how far the landmarks are apart.
-    at_images = level.at_images(state.u)
-    warped, value, slope = objective.similarity.evaluate(at_images)
+    warped, value, slope = objective.similarity.evaluate(state.u, level.transfer)
     points = objective.landmarks.evaluate(state.u) if objective.landmarks else None
-    del at_images
     state = _judged(level, state, value, None if points is None else points.distance)
     if level.keep_best and (step == level.steps or not bool(state.active.any())):
         return state, True
     # 2. Force: steepest ascent of the similarity asks for N ∂S/∂warped ∇warped, the landmarks pull at their points.
-    force = image_force(slope, warped, objective.similarity.grid, settings.stencil)
+    force = level.force(slope, warped)
     del warped, slope  # before the next are made
-    force = force if level.transfer is None else level.transfer.gather(force)
     scale = settings.points_weight * math.prod(grid.shape)  # to the unit of N ∂S/∂warped
     load = None if points is None else points.load(grid) * scale
     # 3. Least squares: div and curl of the velocity are paid for, nearly folded places ask for divergence.
