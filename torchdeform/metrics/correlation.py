@@ -212,17 +212,17 @@ def lncc(
     warped_mean, variance = _moments(warped, windows.weight, windows.inverse_count, window, stride)
     product = box_sum(weighted(fixed * warped, windows.weight), window, stride) * windows.inverse_count
     covariance = _raised(product - windows.mean * warped_mean)
-    return mean(covariance.square() / (windows.variance * variance), windows.window_weight)
+    return mean(covariance.square() / (windows.variance * (variance + LNCC_FLOOR)), windows.window_weight)
 
 
 def _windows(fixed: Tensor, weight: Tensor | None, window: int, stride: int) -> _Windows:
     ones = fixed.new_ones(1, 1, *fixed.shape[2:]) if weight is None else weight
     inverse_count = 1 / box_sum(ones, window, stride).clamp(min=_EMPTY)
     middle, variance = _moments(fixed, weight, inverse_count, window, stride)
-    counted = contrast((variance - LNCC_FLOOR).clamp(min=0))
+    counted = contrast(variance)
     counted = counted if weight is None else counted * centres(weight, stride)
     counted = counted / per_item(counted.flatten(1).mean(1).clamp(min=_FLAT), counted)
-    return _Windows(weight, counted, inverse_count, middle, variance)
+    return _Windows(weight, counted, inverse_count, middle, variance + LNCC_FLOOR)
 
 
 def _raised(covariance: Tensor) -> Tensor:
@@ -239,11 +239,16 @@ def contrast(variance: Tensor, deviation: float = LNCC_CONTRAST) -> Tensor:
 def _moments(
     image: Tensor, weight: Tensor | None, inverse_count: Tensor, window: int, stride: int
 ) -> tuple[Tensor, Tensor]:
-    """Return mean and variance + ε in the window around each voxel."""
-    first = weighted(image, weight)
-    sums = box_sum(torch.cat([first, first * image], dim=1), window, stride)
+    """Return mean and variance in the window around each voxel."""
+
+    def powers(rows: slice) -> Tensor:
+        part = image[:, :, rows]
+        first = weighted(part, None if weight is None else weight[:, :, rows])
+        return torch.cat([first, first * part], dim=1)
+
+    sums = box_sum_by_rows(powers, image.shape[2:], image, window, stride)
     first, square = (sums * inverse_count).chunk(2, dim=1)
-    return first, (square - first * first).clamp(min=0) + LNCC_FLOOR
+    return first, (square - first * first).clamp(min=0)
 
 
 def _products(warped: Tensor, fixed: Tensor, weight: Tensor | None) -> Tensor:
@@ -266,8 +271,7 @@ def local_contrast(image: Tensor, window: int, deviation: float = LNCC_CONTRAST)
 
 def window_moments(image: Tensor, window: int) -> tuple[Tensor, Tensor]:
     """Return mean and variance of the part of the window around each voxel that is inside, both ``(B, C, *S)``."""
-    middle = window_mean(image, window)
-    return middle, (window_mean(image * image, window) - middle * middle).clamp(min=0)
+    return _moments(image, None, 1 / box_sum(torch.ones_like(image[:1, :1]), window), window, 1)
 
 
 def window_mean(image: Tensor, window: int) -> Tensor:
