@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import FrozenInstanceError
+from threading import get_ident
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchdeform.core import grid as module
-from torchdeform.core.grid import Grid, over_slabs, slabs
+from torchdeform.core.grid import Grid, on_threads, over_slabs, slabs
 from torchdeform.errors import InputError
 
 SHAPES = st.integers(2, 3).flatmap(lambda dim: st.tuples(*[st.integers(2, 9)] * dim))
@@ -137,3 +138,27 @@ def test_over_slabs_is_the_whole_and_so_is_its_gradient(monkeypatch):
     assert not over_slabs(lambda rows: field.detach()[:, :, rows], grid.shape, field.device).requires_grad
     points = over_slabs(lambda rows: grid.points(rows=rows), grid.shape, field.device)
     assert torch.equal(points, grid.points())
+
+
+def test_threads_do_all_parts_and_say_what_went_wrong(monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    parts, seen, modes = [slice(k, k + 1) for k in range(9)], torch.zeros(9), []
+
+    def work(rows: slice) -> None:
+        seen[rows] += 1
+        modes.append((torch.is_grad_enabled(), torch.is_inference_mode_enabled(), get_ident()))
+
+    with torch.no_grad():
+        on_threads(work, parts, seen.device)
+    assert torch.equal(seen, torch.ones(9))
+    assert {mode[:2] for mode in modes} == {(False, False)}
+    assert get_ident() not in {mode[2] for mode in modes}
+    with torch.inference_mode():
+        on_threads(work, parts, seen.device)
+    assert modes[-1][:2] == (False, True)
+
+    def fail(rows: slice) -> None:
+        raise ValueError(f"row {rows.start}")
+
+    with pytest.raises(ValueError, match="row 0"), torch.no_grad():
+        on_threads(fail, parts, seen.device)

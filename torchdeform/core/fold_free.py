@@ -9,10 +9,10 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from torchdeform.core.derivatives import jacobian_determinant
+from torchdeform.core.derivatives import jacobian_determinant, slab_of
 from torchdeform.core.diagnostics import one_sided_determinant
-from torchdeform.core.grid import Grid, per_item
-from torchdeform.core.resampling import MAX_POOL
+from torchdeform.core.grid import Grid, over_slabs, per_item
+from torchdeform.core.resampling import MAX_POOL, least_rows
 from torchdeform.errors import ComputationError
 
 Trial = TypeVar("Trial")
@@ -116,8 +116,13 @@ def smooth_elastically(u: Tensor, share: Tensor, grid: Grid) -> Tensor:
         share: from 0 to 1, for each item ``(B,)``, or what broadcasts to ``(B, 1, *S)``.
         grid: its grid.
     """
-    share = per_item(share, u) if share.dim() == 1 else share
-    return keep_faces(torch.lerp(u, neighbour_mean(u), share.expand_as(u)), u, grid)
+    share = (per_item(share, u) if share.dim() == 1 else share).expand_as(u)
+
+    def smoothed(rows: slice) -> Tensor:
+        mean = slab_of(lambda part, _: neighbour_mean(part), u, grid, rows)
+        return torch.lerp(u[:, :, rows], mean, share[:, :, rows])
+
+    return keep_faces(over_slabs(smoothed, grid.shape, u.device, least=least_rows(grid.shape)), u, grid)
 
 
 def neighbour_mean(field: Tensor) -> Tensor:
@@ -126,7 +131,7 @@ def neighbour_mean(field: Tensor) -> Tensor:
         count = field.shape[axis]
         ends = field.narrow(axis, 1, 1), field.narrow(axis, count - 2, 1)
         wide = torch.cat([ends[0], field, ends[1]], dim=axis)
-        field = (wide.narrow(axis, 0, count) + wide.narrow(axis, 2, count)) / 4 + field / 2
+        field = (wide.narrow(axis, 0, count) + wide.narrow(axis, 2, count)).mul_(1 / 4).add_(field, alpha=1 / 2)
     return field
 
 

@@ -1,7 +1,7 @@
 """Matrices along the axes of a field, with few entries a row, near one another: interpolation, smoothing, windows."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,11 +9,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchdeform.core.grid import Grid
+from torchdeform.core.grid import Grid, over_slabs
 from torchdeform.core.tables import kept
 
 # Factor by which voxels grow until a grid has few enough nodes.
 _COARSER = 1.05
+
+# Gives what a field ``(B, C, *S)`` is in some rows of its first axis.
+Rows = Callable[[slice], Tensor]
+
+# Rows of a slab at least: fewer are not worth the calls.
+_SLAB_ROWS = 8
 
 # Rows of a block: with fewer rows fewer of its entries are 0, but small products are slow. Two fields of 4096² on half
 # as many nodes an axis: 0.1 s, against 1.4 s when entries are taken one by one.
@@ -84,11 +90,31 @@ def _lines(field: Tensor, axis: int) -> Tensor:
     return field.view(before, size, after)
 
 
+def least_rows(shape: Sequence[int]) -> int:
+    """Return the rows of a slab at least; all where gradients may be wanted, to which every slab would add a whole."""
+    return shape[0] if torch.is_grad_enabled() else _SLAB_ROWS
+
+
 def multiply(field: Tensor, factors: Sequence[Banded | None]) -> Tensor:
     """Return the products of a field ``(B, C, *S)`` with one matrix an axis; None leaves an axis as it is."""
     for axis, factor in enumerate(factors, start=2):
         field = field if factor is None else factor.along(field, axis)
     return field
+
+
+def rows_of_product(field: Tensor, factors: Sequence[Banded | None]) -> Rows:
+    """Return what gives some rows of `multiply`, for products with more nodes than the field."""
+    first, *others = factors
+    field = multiply(field, [first])
+    return lambda rows: multiply(field[:, :, rows], [None, *others])
+
+
+def multiply_by_rows(
+    values: Rows, shape: Sequence[int], device: torch.device, first: Banded | None, others: Sequence[Banded | None]
+) -> Tensor:
+    """Return `multiply` of a field on ``shape`` that is made slab by slab, for products with fewer nodes."""
+    parts = over_slabs(lambda rows: multiply(values(rows), [None, *others]), shape, device, least=least_rows(shape))
+    return multiply(parts, [first])
 
 
 def interpolation(coarse: int, fine: int, like: Tensor) -> Banded | None:
@@ -194,12 +220,16 @@ def box_sum(x: Tensor, window: int, stride: int = 1) -> Tensor:
     Notes:
         Linear, with stride 1 self-adjoint. No running total, so nothing cancels in float32.
     """
-    for axis in range(2, x.dim()):
-        x = _windows(x.shape[axis], window, stride, x.dtype, x.device)[0].along(x, axis)
-    return x
+    return box_sum_by_rows(lambda rows: x[:, :, rows], x.shape[2:], x, window, stride)
 
 
-def box_sum_transpose(y: Tensor, window: int, stride: int, shape: tuple[int, ...]) -> Tensor:
+def box_sum_by_rows(values: Rows, shape: Sequence[int], like: Tensor, window: int, stride: int) -> Tensor:
+    """Return `box_sum` of a field on ``shape``, of the type of ``like``, that is made slab by slab."""
+    first, *others = (_windows(n, window, stride, like.dtype, like.device)[0] for n in shape)
+    return multiply_by_rows(values, shape, like.device, first, others)
+
+
+def box_sum_transpose(y: Tensor, window: int, stride: int, shape: tuple[int, ...]) -> Rows:
     """Return at each node Σ y over the windows that hold it: the transpose of `box_sum` on ``shape``.
 
     Args:
@@ -209,11 +239,9 @@ def box_sum_transpose(y: Tensor, window: int, stride: int, shape: tuple[int, ...
         shape: S.
 
     Returns:
-        ``(B, C, *S)``.
+        What gives some rows of the first axis of ``(B, C, *S)``.
     """
-    for axis, size in reversed(list(enumerate(shape, start=2))):
-        y = _windows(size, window, stride, y.dtype, y.device)[1].along(y, axis)
-    return y
+    return rows_of_product(y, [_windows(n, window, stride, y.dtype, y.device)[1] for n in shape])
 
 
 def centres(x: Tensor, stride: int) -> Tensor:
@@ -259,12 +287,20 @@ class Transfer:
         """Return a field ``(B, C, *coarse)`` at the nodes of the fine grid, by linear interpolation."""
         return multiply(field, self._ups)
 
-    def gather(self, force: Tensor) -> Tensor:
+    def rows(self, field: Tensor) -> Rows:
+        """Return what gives some rows of the first axis of `up`."""
+        return rows_of_product(field, self._ups)
+
+    def gather(self, force: Rows) -> Tensor:
         """Return the force density on the coarse grid that does the same work as one ``(B, C, *fine)``.
 
         The transpose of `up`, divided by the number of fine nodes to a coarse one.
+
+        Args:
+            force: gives it in some rows of the first axis.
         """
-        return multiply(force, self._downs)
+        first, *others = self._downs
+        return multiply_by_rows(force, self.fine.shape, self.like.device, first, others)
 
     @cached_property
     def _ups(self) -> list[Banded | None]:

@@ -9,14 +9,18 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.core.derivatives import LEAST_ROWS, cofactors, derivative, determinant, map_jacobian, slab_of
-from torchdeform.core.grid import Grid, over_slabs, require_float
-from torchdeform.core.resampling import AVERAGE_POOL, prolong
+from torchdeform.core.grid import Grid, on_threads, over_slabs, parts_of, require_float
+from torchdeform.core.resampling import AVERAGE_POOL, Rows, least_rows, prolong
+from torchdeform.core.tables import numbers_are_real
 from torchdeform.errors import InputError, require_choice
 
 _MODES = {"linear": "bilinear", "nearest": "nearest"}
 
 # Fewer points than this are not worth more than one thread.
 _POINTS_PER_THREAD = 2**13
+
+# Points that `_gathered` takes at once: a core's cache holds what belongs to them.
+_POINTS_AT_ONCE = 2**15
 
 # Newton's method in `invert`: a smaller determinant counts as this one, and a node is left where it is when no step
 # down to this fraction brings it nearer.
@@ -106,6 +110,13 @@ def warp(image: Tensor, u: Tensor, grid: Grid, *, mode: str = "linear", outside:
     return torch.where(inside_box(grid.points(dtype=u.dtype, device=u.device) + u, grid), values, outside)
 
 
+def warp_by_rows(image: Tensor, u: Rows, grid: Grid) -> Tensor:
+    """Return `warp` of an image by a displacement that is made slab by slab."""
+    return over_slabs(
+        lambda rows: _pulled(image, u(rows), grid, rows), grid.shape, image.device, least=least_rows(grid.shape)
+    )
+
+
 def _pulled(image: Tensor, u: Tensor, grid: Grid, rows: slice, mode: str = "linear") -> Tensor:
     """Return image(x + u(x)) for the nodes x in some rows of the first axis, u being given there."""
     first, *others = _lines(grid, u)
@@ -151,6 +162,8 @@ def _sample(image: Tensor, normalised: Tensor, mode: str) -> Tensor:
         raise InputError(f"sample: image has {image.shape[0]} batch items but the points have {items}")
     if normalised.numel() == 0:  # no points, which grid_sample refuses
         return image.new_zeros(max(items, image.shape[0]), image.shape[1], *shape)
+    if mode == "linear" and _is_plain_volume(image, normalised):
+        return _gathered(image, normalised.to(image.dtype))
     parts = _parts(image, normalised)
     batch = max(items, image.shape[0]) * parts
     where = normalised.to(image.dtype).reshape(items, dim, parts, -1).permute(0, 2, 3, 1).flatten(0, 1)
@@ -160,6 +173,48 @@ def _sample(image: Tensor, normalised: Tensor, mode: str) -> Tensor:
     return (
         values.reshape(-1, parts, image.shape[1], where.shape[-2]).transpose(1, 2).reshape(-1, image.shape[1], *shape)
     )
+
+
+def _is_plain_volume(image: Tensor, normalised: Tensor) -> bool:
+    """Whether `_gathered` will do: a volume on the CPU, while nothing looks on."""
+    wanted = torch.is_grad_enabled() and (image.requires_grad or normalised.requires_grad)
+    return image.dim() == 5 and image.device.type == "cpu" and not wanted and numbers_are_real()
+
+
+def _gathered(image: Tensor, normalised: Tensor) -> Tensor:
+    """Return what grid_sample does with volumes, where it takes one point after the other, in two thirds of the time.
+
+    Args:
+        image: ``(B or 1, C, *S)``.
+        normalised: ``(B or 1, 3, *T)``, of the same type.
+    """
+    batch, shape = max(len(image), len(normalised)), normalised.shape[2:]
+    places = normalised.flatten(2).expand(batch, -1, -1)
+    values = image.new_empty(batch, image.shape[1], places.shape[2])
+    for volume, where, found in zip(image.expand(batch, *image.shape[1:]), places, values, strict=True):
+        on_threads(partial(_gather, volume, where, found), parts_of(where.shape[1], _POINTS_AT_ONCE), image.device)
+    return values.view(batch, -1, *shape)
+
+
+def _gather(volume: Tensor, places: Tensor, values: Tensor, some: slice) -> None:
+    """Write some of the values ``(C, N)`` of a volume ``(C, *S)`` at places ``(3, N)`` of grid_sample's box."""
+    places, values = places[:, some], values[:, some]
+    sizes, flat, count = volume.shape[1:], volume.flatten(1), places.shape[1]
+    kind = torch.int32 if flat.shape[1] < 2**31 else torch.int64
+    index, shares, offsets = torch.zeros(count, dtype=kind), [], [0]
+    for size, place in zip(sizes, reversed(places.unbind()), strict=True):
+        at = place.add(1).mul_((size - 1) / 2).clamp_(0, size - 1)
+        low = at.to(kind).clamp_(0, size - 2)  # NaN, too, has to be somewhere
+        index.mul_(size).add_(low)
+        offsets = [o * size + k for o in offsets for k in (0, 1)]
+        shares.append(at.sub_(low))
+    corners = flat.new_empty(8, count)
+    for channel, value in zip(flat, values, strict=True):
+        for offset, corner in zip(offsets, corners, strict=True):
+            torch.index_select(channel[offset:], 0, index, out=corner)
+        edges = corners[::2].lerp_(corners[1::2], shares[2])
+        faces = edges[::2].lerp_(edges[1::2], shares[1])
+        torch.lerp(*faces, shares[0], out=value)
 
 
 def _parts(image: Tensor, normalised: Tensor) -> int:

@@ -6,8 +6,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchdeform.core.grid import per_item
-from torchdeform.core.resampling import box_sum, box_sum_transpose, centres
+from torchdeform.core.grid import over_slabs, per_item
+from torchdeform.core.resampling import box_sum, box_sum_by_rows, box_sum_transpose, centres, least_rows
 from torchdeform.metrics.base import (
     IntensityRange,
     Similarity,
@@ -157,8 +157,12 @@ class LocalCrossCorrelation(Similarity):
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         warped = at_least_float32(warped)
         windows = self._windows(mask, warped)
-        sums = box_sum(_products(warped, self.fixed, windows.weight), self.window, self.stride)
-        sums.mul_(windows.inverse_count)
+        shape = tuple(warped.shape[2:])
+
+        def products(rows: slice) -> Tensor:
+            return _products(*(t if t is None else t[:, :, rows] for t in (warped, self.fixed, windows.weight)))
+
+        sums = box_sum_by_rows(products, shape, warped, self.window, self.stride).mul_(windows.inverse_count)
         warped_mean, square, product = sums.chunk(3, dim=1)
         covariance = _raised(product.addcmul_(warped_mean, windows.mean, value=-1))
         variance = square.addcmul_(warped_mean, warped_mean, value=-1).clamp_(min=0).add_(LNCC_FLOOR)
@@ -167,9 +171,14 @@ class LocalCrossCorrelation(Similarity):
         a = correlation.mul_(windows.inverse_count * (2 * warped[0, 0].numel() / correlation[0, 0].numel()))
         b = a * covariance / variance
         back = torch.cat([a, b, b * warped_mean - a * windows.mean], dim=1)
-        a, b, rest = box_sum_transpose(back, self.window, self.stride, tuple(warped.shape[2:])).chunk(3, dim=1)
-        slope = torch.addcmul(rest, self.fixed, a).addcmul_(warped, b, value=-1)
-        return value, slope if windows.weight is None else slope.mul_(windows.weight)
+        backs = box_sum_transpose(back, self.window, self.stride, shape)
+
+        def slope(rows: slice) -> Tensor:
+            a, b, rest = backs(rows).chunk(3, dim=1)
+            part = rest.addcmul(self.fixed[:, :, rows], a).addcmul_(warped[:, :, rows], b, value=-1)
+            return part if windows.weight is None else part.mul_(windows.weight[:, :, rows])
+
+        return value, over_slabs(slope, shape, warped.device, least=least_rows(shape))
 
 
 def lncc(
@@ -210,17 +219,17 @@ def lncc(
     warped_mean, variance = _moments(warped, windows.weight, windows.inverse_count, window, stride)
     product = box_sum(weighted(fixed * warped, windows.weight), window, stride) * windows.inverse_count
     covariance = _raised(product - windows.mean * warped_mean)
-    return mean(covariance.square() / (windows.variance * variance), windows.window_weight)
+    return mean(covariance.square() / (windows.variance * (variance + LNCC_FLOOR)), windows.window_weight)
 
 
 def _windows(fixed: Tensor, weight: Tensor | None, window: int, stride: int, noise: Tensor | None = None) -> _Windows:
     ones = fixed.new_ones(1, 1, *fixed.shape[2:]) if weight is None else weight
     inverse_count = 1 / box_sum(ones, window, stride).clamp(min=_EMPTY)
     middle, variance = _moments(fixed, weight, inverse_count, window, stride)
-    counted = contrast((variance - LNCC_FLOOR).clamp(min=0), noise=noise)
+    counted = contrast(variance, noise=noise)
     counted = counted if weight is None else counted * centres(weight, stride)
     counted = counted / per_item(counted.flatten(1).mean(1).clamp(min=_FLAT), counted)
-    return _Windows(weight, counted, inverse_count, middle, variance)
+    return _Windows(weight, counted, inverse_count, middle, variance + LNCC_FLOOR)
 
 
 def _raised(covariance: Tensor) -> Tensor:
@@ -244,11 +253,16 @@ def contrast(variance: Tensor, deviation: float = LNCC_CONTRAST, noise: Tensor |
 def _moments(
     image: Tensor, weight: Tensor | None, inverse_count: Tensor, window: int, stride: int
 ) -> tuple[Tensor, Tensor]:
-    """Return mean and variance + ε in the window around each voxel."""
-    first = weighted(image, weight)
-    sums = box_sum(torch.cat([first, first * image], dim=1), window, stride)
+    """Return mean and variance in the window around each voxel."""
+
+    def powers(rows: slice) -> Tensor:
+        part = image[:, :, rows]
+        first = weighted(part, None if weight is None else weight[:, :, rows])
+        return torch.cat([first, first * part], dim=1)
+
+    sums = box_sum_by_rows(powers, image.shape[2:], image, window, stride)
     first, square = (sums * inverse_count).chunk(2, dim=1)
-    return first, (square - first * first).clamp(min=0) + LNCC_FLOOR
+    return first, (square - first * first).clamp(min=0)
 
 
 def _products(warped: Tensor, fixed: Tensor, weight: Tensor | None) -> Tensor:
@@ -271,8 +285,7 @@ def local_contrast(image: Tensor, window: int, deviation: float = LNCC_CONTRAST)
 
 def window_moments(image: Tensor, window: int) -> tuple[Tensor, Tensor]:
     """Return mean and variance of the part of the window around each voxel that is inside, both ``(B, C, *S)``."""
-    middle = window_mean(image, window)
-    return middle, (window_mean(image * image, window) - middle * middle).clamp(min=0)
+    return _moments(image, None, 1 / box_sum(torch.ones_like(image[:1, :1]), window), window, 1)
 
 
 def window_mean(image: Tensor, window: int) -> Tensor:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from time import perf_counter
 from typing import Any
 
@@ -16,7 +16,7 @@ from torchdeform.core.fold_free import largest_share, repair_folds, smooth_elast
 from torchdeform.core.grid import Grid, limit_threads, per_item
 from torchdeform.core.regions import grown
 from torchdeform.core.resampling import Transfer, coarsened, prolong, pyramid_grids
-from torchdeform.core.warp import compose, warp
+from torchdeform.core.warp import compose, warp, warp_by_rows
 from torchdeform.deformation.rigid import RigidHold
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity, weighted
@@ -109,14 +109,19 @@ class SimilarityTerm:
     masks: Tensor | None = None
     fixed_mask: Tensor | None = None
 
-    def evaluate(self, u: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the images warped by u ``(B, D, *S)``, as they are when None, S of each, and N ∂S/∂warped."""
-        warped = self._masked if u is None else warp(self._masked, u, self.grid)
-        del u  # where a coarser grid carries the map, nobody else holds it
+    def evaluate(self, u: Tensor | None = None, transfer: Transfer | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the images warped by u ``(B, D, *S)``, as they are when None, S of each, and N ∂S/∂warped.
+
+        With ``transfer`` the displacement is on a coarser grid.
+        """
+        warped = self._masked if u is None else self._warped(self._masked, u, transfer)
         if self.masks is None:
             return warped, *self.similarity.evaluate(warped, self.fixed_mask)
         warped, mask = warped.tensor_split([-1], dim=1)
         return warped, *self.similarity.evaluate(warped.contiguous(), weighted(mask, self.fixed_mask))
+
+    def _warped(self, images: Tensor, u: Tensor, transfer: Transfer | None) -> Tensor:
+        return warp(images, u, self.grid) if transfer is None else warp_by_rows(images, transfer.rows(u), self.grid)
 
     def on_common_voxels(self, maps: Sequence[Tensor]) -> list[Tensor]:
         """Return S of the images warped by each of the maps ``(B, D, *S)``, over the voxels that all of them see."""
@@ -211,6 +216,11 @@ class Level:
     def at_images(self, u: Tensor) -> Tensor:
         """Return the maps ``(B, D, *S)`` on the grid of the images."""
         return u if self.transfer is None else self.transfer.up(u)
+
+    def force(self, slope: Tensor, warped: Tensor) -> Tensor:
+        """Return the `image_force` on the grid of the map."""
+        force = partial(image_force, slope, warped, self.objective.similarity.grid, self.settings.stencil)
+        return force() if self.transfer is None else self.transfer.gather(force)
 
     @property
     def zero(self) -> Tensor:
@@ -380,17 +390,14 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     """Return the state after one step, and whether it was the last."""
     settings, objective, grid = level.settings, level.objective, level.grid
     # 1. Evaluate: warp the images, compare them, and see how far the landmarks are apart.
-    at_images = level.at_images(state.u)
-    warped, value, slope = objective.similarity.evaluate(at_images)
+    warped, value, slope = objective.similarity.evaluate(state.u, level.transfer)
     points = objective.landmarks.evaluate(state.u) if objective.landmarks else None
-    del at_images
     state = _judged(level, state, value, None if points is None else points.distance)
     if level.keep_best and (step == level.steps or not bool(state.active.any())):
         return state, True
     # 2. Force: steepest ascent of the similarity asks for N ∂S/∂warped ∇warped, the landmarks pull at their points.
-    force = image_force(slope, warped, objective.similarity.grid, settings.stencil)
+    force = level.force(slope, warped)
     del warped, slope  # before the next are made
-    force = force if level.transfer is None else level.transfer.gather(force)
     even, limit = settings.optimiser.evenness, settings.optimiser.limit
     whole = level.tissue is not None  # what is rigid turns as a whole
     force = force if even is None or whole else evened(force, even)

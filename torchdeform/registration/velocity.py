@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from torchdeform.core.derivatives import derivative
+from torchdeform.core.derivatives import derivative, slab_of
 from torchdeform.core.grid import Grid, per_item
 from torchdeform.fem.solver import SolverSettings, solver_of
 from torchdeform.fem.system import DivCurlSystem
@@ -122,10 +123,14 @@ class VelocityMetric:
         return v
 
 
-def image_force(slope: Tensor, warped: Tensor, grid: Grid, by: str = "auto") -> Tensor:
-    """Return the force Σ_c slope_c ∇warped_c ``(B, D, *S)`` from N ∂S/∂warped and the warped image ``(B, C, *S)``."""
-    axes = [(slope * derivative(warped, grid, a, by=by)).sum(1, keepdim=True) for a in range(grid.dim)]
-    return torch.cat(axes, dim=1)
+def image_force(slope: Tensor, warped: Tensor, grid: Grid, by: str = "auto", rows: slice | None = None) -> Tensor:
+    """Return the force Σ_c slope_c ∇warped_c ``(B, D, *S)`` from N ∂S/∂warped and the warped image ``(B, C, *S)``.
+
+    Or some rows of its first axis.
+    """
+    rows = rows or slice(0, grid.shape[0])
+    slopes = (slab_of(partial(derivative, axis=a, by=by), warped, grid, rows) for a in range(grid.dim))
+    return torch.cat([(slope[:, :, rows] * along).sum(1, keepdim=True) for along in slopes], dim=1)
 
 
 def fold_barrier(lowest: Tensor, soft_determinant: float) -> Tensor:
