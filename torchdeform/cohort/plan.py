@@ -203,13 +203,13 @@ def _missing(pair: PairSpec) -> str:
 
 def _contradiction(pair: PairSpec, settings: RegistrationSettings) -> str:
     """Return a sentence if the settings of a pair do not go with its files."""
-    given = {what: f"fixed_{what}" in pair.files for what in ("features", "labels")}
+    features, labels = (f"fixed_{what}" in pair.files for what in ("features", "labels"))
     for path in settings.programs:
         try:
             require_file(Path(path), "program of features")
         except InputError as error:
             return f"features: {error}; see {pair.where}"
-    if problem := contradiction(settings, **given):
+    if problem := contradiction(settings, features=features, labels=labels):
         return f"{problem}; see {pair.where}"
     return _misnamed_tissue(pair, settings)
 
