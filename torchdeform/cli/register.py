@@ -194,8 +194,8 @@ def _can_print(text: str) -> bool:
 
 def _measured(record: dict[str, Any]) -> dict[str, str]:
     """Return lines about labels and landmarks, if they were given."""
-    lines = {}
-    for key, name, unit in (("dice_mean", "Dice", ""), ("landmark_error_mean", "landmark error", f" {record['unit']}")):
+    lines, dice = {}, "Dice (labels in the cost)" if record["labels_in_cost"] else "Dice"
+    for key, name, unit in (("dice_mean", dice, ""), ("landmark_error_mean", "landmark error", f" {record['unit']}")):
         figures = [f"{stage[key]:.4g}" for stage in record["evaluation"].values() if key in stage]
         if figures:
             lines[name] = " -> ".join(figures) + unit

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchdeform.core.grid import Grid, per_item
 from torchdeform.core.image import Image
-from torchdeform.core.intensities import corresponding_channels, intensity_range, to_common_scale
+from torchdeform.core.intensities import corresponding_channels, fill, intensity_range, to_common_scale
 from torchdeform.core.resampling import restrict, with_nodes
 from torchdeform.errors import InputError
 from torchdeform.io.programs import load_program, quiet
@@ -112,11 +112,18 @@ def _made(source: Any, problem: RegistrationProblem) -> tuple[Tensor, Tensor]:
     if source == FILES:
         if problem.features is None:
             raise InputError("register: features: files are channels of both images, but there are none")
-        return problem.features[0].to(fixed), problem.features[1].to(moving)
+        return _filled([field.to(fixed) for field in problem.features], problem)
     if source == MIND:
         return mind_ssc(fixed), mind_ssc(moving)
     program = program_of(source, fixed.device)
     return run_program(program, fixed, name_of(source)), run_program(program, moving, name_of(source))
+
+
+def _filled(fields: list[Tensor], problem: RegistrationProblem) -> tuple[Tensor, Tensor]:
+    """Return a field of each image without what the masks leave out, as the images are."""
+    masks = problem.fixed_mask, problem.moving_mask
+    fixed, moving = (f if mask is None else fill(f, mask) for f, mask in zip(fields, masks, strict=True))
+    return fixed, moving
 
 
 def _prepared(
@@ -125,12 +132,12 @@ def _prepared(
     """Return features as a measure compares them: by ``ssd`` unit vectors, by others channels from 0 to 1.
 
     Notes:
-        The mean over K channels of the squared difference of vectors of length √(K/2) is 1 − cos of their angle.
-        Self-similarities are vectors of one scale already.
+        The mean over K channels of the squared difference of vectors of length √(K/2) is 1 − cos of their angle. One
+        channel alone has no direction, and self-similarities are vectors of one scale already.
     """
     if source == MIND:
         return features
-    if measure != "ssd":
+    if measure != "ssd" or features[0].shape[1] == 1:
         masks = problem.fixed_mask, problem.moving_mask
         return to_common_scale(features, masks, jointly=needs_common_scale(measure))
     first, second = (_unit(vectors) for vectors in features)
@@ -301,17 +308,26 @@ def _of_labels(problem: RegistrationProblem, weight: float) -> Iterator[Channels
     grid = with_nodes(problem.grid, max(MOST_PROBABILITIES // len(names), 2**problem.grid.dim))
     fixed_mask, moving_mask = problem.masks_on(grid)
     mask = moving_mask if fixed_mask is None else weighted(fixed_mask, moving_mask)
-    for some in (names[k : k + _AT_ONCE] for k in range(0, len(names), _AT_ONCE)):
-        pairs = [_probabilities(problem, name, grid, mask) for name in some]
-        fixed, moving = (torch.cat(fields, dim=1) for fields in zip(*pairs, strict=True))
-        yield Channels(grid, fixed, moving, "ssd", weight * len(some) / len(names))
+    known = torch.stack([_in_both(problem.labels, name) for name in names]).to(problem.fixed)  # labels of items
+    known *= (len(names) / known.sum(0).clamp(min=1)).sqrt()
+    for some in (slice(k, k + _AT_ONCE) for k in range(0, len(names), _AT_ONCE)):
+        pairs = [_probabilities(problem, name, grid, mask) for name in names[some]]
+        fixed, moving = (
+            torch.cat([field * per_item(scale, field) for field, scale in zip(fields, known[some], strict=True)], dim=1)
+            for fields in zip(*pairs, strict=True)
+        )
+        yield Channels(grid, fixed, moving, "ssd", weight * fixed.shape[1] / len(names))
+
+
+def _in_both(labels: tuple[Tensor, Tensor], name: int) -> Tensor:
+    """Return for each item whether both of its images have the label, ``(B,)``."""
+    return (labels[0] == name).flatten(1).any(1) & (labels[1] == name).flatten(1).any(1)
 
 
 def _probabilities(problem: RegistrationProblem, name: int, grid: Grid, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return those of one label in both images ``(B, 1, *S)``; 0 in items of which one image does not have it."""
-    regions = [labels == name for labels in problem.labels or ()]
-    known = per_item(torch.stack([region.flatten(1).any(1) for region in regions]).all(0), regions[0])
-    fixed, moving = (restrict((region & known).to(problem.fixed), problem.grid, grid) for region in regions)
+    """Return those of one label in both images, divided as they are to be, both ``(B, 1, *S)``."""
+    regions = [(labels == name).to(problem.fixed) for labels in problem.labels or ()]
+    fixed, moving = (restrict(region, problem.grid, grid) for region in _filled(regions, problem))
     size = mean(fixed.square() + moving.square(), relative_weight(mask, fixed))
     scale = per_item(torch.where(size > 0, size, 1).rsqrt(), fixed)
     return fixed * scale, moving * scale
