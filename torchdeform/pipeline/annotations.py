@@ -49,12 +49,12 @@ def check_points(image: Image, points: Tensor, path: Path) -> Iterator[Finding]:
         yield Finding(ERROR if count == len(points) else WARNING, text)
 
 
-def check_labels(image: Image, labels: Image) -> Iterator[Finding]:
+def check_labels(image: Image, labels: Image, what: str = "labels") -> Iterator[Finding]:
     """Labels of another size than their image, or in another place.
 
     Args:
         image: the image.
-        labels: regions of it. A grid of their own is fine if it covers the same part of the world.
+        labels: regions of it, or other values. A grid of their own is fine if it covers the same part of the world.
 
     Notes:
         Pictures have no place in the world, so labels and picture must agree pixel by pixel.
@@ -68,7 +68,7 @@ def check_labels(image: Image, labels: Image) -> Iterator[Finding]:
     else:
         return
     if _PIXELS in (image.unit, labels.unit):
-        yield Finding(ERROR, _of_another_size(image, labels, apart))
+        yield Finding(ERROR, _of_another_size(image, labels, apart, what))
         return
     shares = overlap(image, labels), overlap(labels, image)
     if max(shares) == 0:
@@ -90,13 +90,13 @@ def check_features(images: tuple[Image, Image], features: tuple[Image | None, Im
         return
     for image, channels in zip(images, features, strict=True):
         if channels is not None:
-            yield from check_labels(image, channels)
+            yield from check_labels(image, channels, "features")
 
 
-def _of_another_size(image: Image, labels: Image, apart: str) -> str:
+def _of_another_size(image: Image, labels: Image, apart: str, what: str) -> str:
     if labels.grid.shape == image.grid.shape:
         return f"{apart}, or save both with the same spacing"
     return (
-        f"{labels.name} is {labels.grid.size_text} but {image.name} is {image.grid.size_text}; give one with a "
+        f"{labels.name} is {labels.grid.size_text} but {image.name} is {image.grid.size_text}; give {what} with a "
         "value for every pixel, turned as the image is"
     )
