@@ -24,7 +24,7 @@ from torchdeform.metrics.correlation import window_mean
 from torchdeform.metrics.noise import Noise
 from torchdeform.metrics.similarity import features, make_similarity
 from torchdeform.registration.landmarks import ForwardLandmarks, Landmarks
-from torchdeform.registration.problem import RegistrationProblem
+from torchdeform.registration.problem import Channels, RegistrationProblem
 from torchdeform.registration.result import Callback, LevelRecord, Progress
 from torchdeform.registration.settings import MetricSettings, RegistrationSettings
 from torchdeform.registration.tissue import Tissue
@@ -143,28 +143,85 @@ def common_mask(fixed: Tensor | None, moving: Tensor | None, maps: Sequence[Tens
     return mask
 
 
-def forward_similarity(problem: RegistrationProblem, settings: RegistrationSettings) -> SimilarityTerm:
-    """Return the similarity of the fixed and the warped moving image."""
-    measure, window = settings.similarity.measure, settings.similarity.window
+def compared(problem: RegistrationProblem, settings: RegistrationSettings) -> tuple[Channels, ...]:
+    """Return all that is compared: what a measure takes of the intensities, if they are, and other channels."""
+    if not problem.intensities:
+        return problem.channels
+    measure = settings.similarity.measure
     fixed, moving = (features(measure, image) for image in (problem.fixed, problem.moving))
     noise = problem.noise and problem.noise.variance
-    similarity = make_similarity(measure, fixed, window, grid=problem.grid, noise=noise)
-    return SimilarityTerm(problem.grid, moving, similarity, problem.moving_mask, problem.fixed_mask)
+    return Channels(problem.grid, fixed, moving, measure, noise=noise), *problem.channels
+
+
+def forward_similarity(
+    problem: RegistrationProblem, channels: Channels, settings: RegistrationSettings
+) -> SimilarityTerm:
+    """Return the similarity of the fixed and the warped moving channels."""
+    window, noise = settings.similarity.window, channels.noise
+    similarity = make_similarity(channels.measure, channels.fixed, window, grid=channels.grid, noise=noise)
+    fixed_mask, moving_mask = problem.masks_on(channels.grid)
+    return SimilarityTerm(channels.grid, channels.moving, similarity, moving_mask, fixed_mask)
+
+
+@dataclass(frozen=True)
+class Addition:
+    """A similarity that is added to that of the images.
+
+    Attributes:
+        similarity: S, on its grid.
+        weight: of S.
+        transfer: between its grid and that of the map, None where they are one.
+    """
+
+    similarity: SimilarityTerm
+    weight: float
+    transfer: Transfer | None = None
+
+    def evaluate(self, u: Tensor, stencil: str) -> tuple[Tensor, Tensor]:
+        """Return what is added for maps u ``(B, D, *S)``, and its force N ∂S/∂u likewise, N being that of the nodes."""
+        term = self.similarity
+        warped, value, slope = term.evaluate(u, self.transfer)
+        force = partial(image_force, slope * (self.weight / warped.shape[1]), warped, term.grid, stencil)
+        return self.weight * value, force() if self.transfer is None else self.transfer.gather(force)
+
+    def on_common_voxels(self, maps: Sequence[Tensor]) -> list[Tensor]:
+        """Return what is added for each of the maps, over the voxels that all of them see."""
+        return [self.weight * value for value in self.similarity.on_common_voxels([self._at(u) for u in maps])]
+
+    def _at(self, u: Tensor) -> Tensor:
+        return u if self.transfer is None else self.transfer.up(u)
 
 
 @dataclass(frozen=True)
 class Objective:
-    """What is maximised on the grid of one level, S − points_weight · E, and which maps move together.
+    """What is maximised on the grid of one level, S + Σ wₖ Sₖ − points_weight · E, and which maps move together.
 
     Attributes:
         similarity: S of the images, on their grid.
         landmarks: E of the pairs of points, on the grid of the map; None without.
         coupling: of the maps.
+        more: wₖ Sₖ.
     """
 
     similarity: Any
     landmarks: Landmarks | None = None
     coupling: Coupling = _FREE
+    more: tuple[Addition, ...] = ()
+
+    def on_common_voxels(self, maps: Sequence[Tensor], at_images: Sequence[Tensor]) -> list[Tensor]:
+        """Return S + Σ wₖ Sₖ of the maps, which are given on the grid of the images too, over what all of them see."""
+        values = self.similarity.on_common_voxels(at_images)
+        for addition in self.more:
+            values = [value + other for value, other in zip(values, addition.on_common_voxels(maps), strict=True)]
+        return values
+
+
+def additions(terms: Sequence[SimilarityTerm], channels: Sequence[Channels], grid: Grid) -> tuple[Addition, ...]:
+    """Return the similarities of channels with their weights, the map being on ``grid``."""
+    return tuple(
+        Addition(term, one.weight, Transfer(term.grid, grid, term.images) if term.grid != grid else None)
+        for term, one in zip(terms, channels, strict=True)
+    )
 
 
 # From the problem on a level's grid, the grid of its map, and the settings.
@@ -261,7 +318,9 @@ class State:
 def forward_objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
     """Return what is maximised where the moving image is warped onto the fixed one, the map being on ``grid``."""
     pairs = problem.pairs if settings.points_weight > 0 else None
-    return Objective(forward_similarity(problem, settings), pairs and ForwardLandmarks(*pairs, grid))
+    channels = compared(problem, settings)
+    first, *others = [forward_similarity(problem, one, settings) for one in channels]
+    return Objective(first, pairs and ForwardLandmarks(*pairs, grid), more=additions(others, channels[1:], grid))
 
 
 def optimise_levels(
@@ -374,7 +433,7 @@ def best_map(
         maps: displacements ``(B, D, *S)``; of equal ones the last is returned.
         level: whose maps they are; None for maps on the grid of the images.
     """
-    values = objective.similarity.on_common_voxels([level.at_images(u) if level else u for u in maps])
+    values = objective.on_common_voxels(maps, [level.at_images(u) if level else u for u in maps])
     goals = values
     if objective.landmarks:
         distances = [objective.landmarks.evaluate(u).distance for u in maps]
@@ -390,14 +449,17 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     """Return the state after one step, and whether it was the last."""
     settings, objective, grid = level.settings, level.objective, level.grid
     # 1. Evaluate: warp the images, compare them, and see how far the landmarks are apart.
+    more = [addition.evaluate(state.u, settings.stencil) for addition in objective.more]
     warped, value, slope = objective.similarity.evaluate(state.u, level.transfer)
+    value = sum((added for added, _ in more), start=value)
     points = objective.landmarks.evaluate(state.u) if objective.landmarks else None
     state = _judged(level, state, value, None if points is None else points.distance)
     if level.keep_best and (step == level.steps or not bool(state.active.any())):
         return state, True
     # 2. Force: steepest ascent of the similarity asks for N ∂S/∂warped ∇warped, the landmarks pull at their points.
-    force = level.force(slope, warped)
+    force, channels = level.force(slope, warped), warped.shape[1]
     del warped, slope  # before the next are made
+    force = sum((channels * added for _, added in more), start=force)  # N counts the channels of the images
     even, limit = settings.optimiser.evenness, settings.optimiser.limit
     whole = level.tissue is not None  # what is rigid turns as a whole
     force = force if even is None or whole else evened(force, even)
@@ -440,9 +502,9 @@ def fold_free_step(level: Level, state: State, v: Tensor) -> tuple[Tensor, Tenso
 
     No one-sided determinant falls below ``min_determinant``, or below the smallest one there was if that was less. The
     step is shortened around the nodes where one would, so that a few of them do not hold back all others; where that is
-    not enough it is halved as a whole, and as the trial then tends to u, a bold step ends as a short one. The extrapolated determinants on the
-    faces of the box are left to `repair_folds`, after the last step: they take as long as all the others and hardly
-    ever fold alone.
+    not enough it is halved as a whole, and as the trial then tends to u, a bold step ends as a short one. The
+    extrapolated determinants on the faces of the box are left to `repair_folds`, after the last step: they take as long
+    as all the others and hardly ever fold alone.
     """
     coupling = level.objective.coupling
     floor = state.lowest.flatten(1).amin(1).clamp(max=level.settings.folds.min_determinant)
