@@ -214,7 +214,7 @@ def _gather(volume: Tensor, places: Tensor, values: Tensor, some: slice) -> None
             torch.index_select(channel[offset:], 0, index, out=corner)
         edges = corners[::2].lerp_(corners[1::2], shares[2])
         faces = edges[::2].lerp_(edges[1::2], shares[1])
-        torch.lerp(*faces, shares[0], out=value)
+        torch.lerp(faces[0], faces[1], shares[0], out=value)
 
 
 def _parts(image: Tensor, normalised: Tensor) -> int:

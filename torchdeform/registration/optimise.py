@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
 from time import perf_counter
 from typing import Any
 
@@ -105,12 +105,16 @@ class SimilarityTerm:
         return warped, *self.similarity.evaluate(warped.contiguous(), weighted(mask, self.fixed_mask))
 
     def _warped(self, images: Tensor, u: Tensor, transfer: Transfer | None) -> Tensor:
-        return warp(images, u, self.grid) if transfer is None else warp_by_rows(images, transfer.rows(u), self.grid)
+        return warp(images, u, self.grid) if transfer is None else warp_by_rows(images, transfer.up(u), self.grid)
 
-    def on_common_voxels(self, maps: Sequence[Tensor]) -> list[Tensor]:
+    def on_common_voxels(self, maps: Sequence[Tensor], transfer: Transfer | None = None) -> list[Tensor]:
         """Return S of the images warped by each of the maps ``(B, D, *S)``, over the voxels that all of them see."""
-        mask = common_mask(self.fixed_mask, self.masks, maps, self.grid)
-        return [self.similarity.evaluate(warp(self.images, u, self.grid), mask)[0] for u in maps]
+        if self.masks is None:
+            found = (self._warped(self.images, u, transfer) for u in maps)
+            return [self.similarity.evaluate(warped, self.fixed_mask)[0] for warped in found]
+        pairs = [self._warped(self._masked, u, transfer).tensor_split([-1], dim=1) for u in maps]
+        mask = reduce(lambda mask, pair: weighted(pair[1], mask), pairs, self.fixed_mask)
+        return [self.similarity.evaluate(warped.contiguous(), mask)[0] for warped, _ in pairs]
 
     @cached_property
     def _masked(self) -> Tensor:
@@ -193,10 +197,6 @@ class Level:
     def shape(self) -> tuple[int, ...]:
         """The grid of the level's images."""
         return self.objective.similarity.grid.shape
-
-    def at_images(self, u: Tensor) -> Tensor:
-        """Return the maps ``(B, D, *S)`` on the grid of the images."""
-        return u if self.transfer is None else self.transfer.up(u)
 
     def force(self, slope: Tensor, warped: Tensor) -> Tensor:
         """Return the `image_force` on the grid of the map."""
@@ -344,7 +344,7 @@ def best_map(
         maps: displacements ``(B, D, *S)``; of equal ones the last is returned.
         level: whose maps they are; None for maps on the grid of the images.
     """
-    values = objective.similarity.on_common_voxels([level.at_images(u) if level else u for u in maps])
+    values = objective.similarity.on_common_voxels(maps, level and level.transfer)
     goals = values
     if objective.landmarks:
         distances = [objective.landmarks.evaluate(u).distance for u in maps]
