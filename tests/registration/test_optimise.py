@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+import torch.nn.functional as F
 from nested_settings import settings_of
 from pictures import bend, blobs, disc
 from tissues import kabsch_residual, turning_bars
 
+from torchdeform.core import grid as core_grid
 from torchdeform.core.diagnostics import one_sided_determinant
 from torchdeform.core.flow import integrate
 from torchdeform.core.grid import Grid
@@ -43,6 +45,25 @@ def test_a_coarser_map_finds_the_motion_without_folds(monkeypatch, shape, symmet
     assert after < 0.3 * before
     assert result.diagnosis.folds.item() == 0
     assert result.displacement.shape[2:] == shape
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("shape", [(40, 33), (24, 21, 18)])
+def test_slabs_of_a_coarser_map_are_what_its_whole_displacement_gives(monkeypatch, shape, masked):
+    monkeypatch.setattr(levels, "_LARGE", 0)
+    monkeypatch.setattr(core_grid, "_SLAB_NODES", {"cpu": 1})
+    grid = Grid(shape)
+    fixed, moving, mask = (torch.rand(2, 1, *shape, dtype=torch.float64) for _ in range(3))
+    problem = RegistrationProblem(grid, fixed, moving, None, mask if masked else None)
+    level = levels.make_level(problem, settings_of(measure="lncc"), levels.forward_objective, 0, 1)
+    assert level.transfer is not None
+    u, term = torch.randn_like(level.zero), level.objective.similarity
+    whole = F.interpolate(u, shape, mode={2: "bilinear", 3: "trilinear"}[len(shape)], align_corners=True)
+    with torch.no_grad():
+        for found, expected in zip(term.evaluate(u, level.transfer), term.evaluate(whole), strict=True):
+            torch.testing.assert_close(found, expected)
+        both = term.on_common_voxels([u, level.zero], level.transfer)
+        torch.testing.assert_close(both, term.on_common_voxels([whole, torch.zeros_like(whole)]))
 
 
 def level_of(grid: Grid, flow: str = "midpoint", **settings) -> levels.Level:

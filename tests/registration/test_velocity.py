@@ -86,6 +86,8 @@ def test_the_force_of_an_image_is_its_gradient(grid, by):
     force = image_force(slope, image, grid, by)
     torch.testing.assert_close(force[:, :2], slope)
     assert grid.dim == 2 or not force[:, 2].any()
+    for rows in (slice(0, 1), slice(3, 7), slice(grid.shape[0] - 1, grid.shape[0])):
+        torch.testing.assert_close(image_force(slope, image, grid, by, rows), force[:, :, rows])
 
 
 def test_steps_fall_to_a_tenth():

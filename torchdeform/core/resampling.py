@@ -283,12 +283,8 @@ class Transfer:
     coarse: Grid
     like: Tensor
 
-    def up(self, field: Tensor) -> Tensor:
+    def up(self, field: Tensor) -> Rows:
         """Return a field ``(B, C, *coarse)`` at the nodes of the fine grid, by linear interpolation."""
-        return multiply(field, self._ups)
-
-    def rows(self, field: Tensor) -> Rows:
-        """Return what gives some rows of the first axis of `up`."""
         return rows_of_product(field, self._ups)
 
     def gather(self, force: Rows) -> Tensor:

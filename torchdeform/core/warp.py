@@ -188,33 +188,32 @@ def _gathered(image: Tensor, normalised: Tensor) -> Tensor:
         image: ``(B or 1, C, *S)``.
         normalised: ``(B or 1, 3, *T)``, of the same type.
     """
-    batch, shape = max(len(image), len(normalised)), normalised.shape[2:]
-    places = normalised.flatten(2).expand(batch, -1, -1)
+    batch, sizes, shape = max(len(image), len(normalised)), image.shape[2:], normalised.shape[2:]
+    volumes, places = (field.flatten(2).expand(batch, -1, -1) for field in (image, normalised))
     values = image.new_empty(batch, image.shape[1], places.shape[2])
-    for volume, where, found in zip(image.expand(batch, *image.shape[1:]), places, values, strict=True):
-        on_threads(partial(_gather, volume, where, found), parts_of(where.shape[1], _POINTS_AT_ONCE), image.device)
+    for one in zip(volumes, places, values, strict=True):
+        on_threads(partial(_gather, sizes, *one), parts_of(places.shape[2], _POINTS_AT_ONCE), image.device)
     return values.view(batch, -1, *shape)
 
 
-def _gather(volume: Tensor, places: Tensor, values: Tensor, some: slice) -> None:
-    """Write some of the values ``(C, N)`` of a volume ``(C, *S)`` at places ``(3, N)`` of grid_sample's box."""
+def _gather(sizes: Sequence[int], volume: Tensor, places: Tensor, values: Tensor, some: slice) -> None:
+    """Write some of the values ``(C, N)`` of a flat volume ``(C, n)`` at places ``(3, N)`` of grid_sample's box."""
     places, values = places[:, some], values[:, some]
-    sizes, flat, count = volume.shape[1:], volume.flatten(1), places.shape[1]
-    kind = torch.int32 if flat.shape[1] < 2**31 else torch.int64
-    index, shares, offsets = torch.zeros(count, dtype=kind), [], [0]
+    kind, count = torch.int32 if volume.shape[1] < 2**31 else torch.int64, places.shape[1]
+    index, shares, offsets = places.new_zeros(count, dtype=kind), [], [0]
     for size, place in zip(sizes, reversed(places.unbind()), strict=True):
         at = place.add(1).mul_((size - 1) / 2).clamp_(0, size - 1)
-        low = at.to(kind).clamp_(0, size - 2)  # NaN, too, has to be somewhere
-        index.mul_(size).add_(low)
+        low = at.floor().clamp_(max=size - 2)
+        index.mul_(size).add_(low.to(kind).clamp_(0))  # NaN, too, has to be somewhere
         offsets = [o * size + k for o in offsets for k in (0, 1)]
         shares.append(at.sub_(low))
-    corners = flat.new_empty(8, count)
-    for channel, value in zip(flat, values, strict=True):
+    corners = volume.new_empty(8, count)
+    for channel, value in zip(volume, values, strict=True):
         for offset, corner in zip(offsets, corners, strict=True):
             torch.index_select(channel[offset:], 0, index, out=corner)
         edges = corners[::2].lerp_(corners[1::2], shares[2])
         faces = edges[::2].lerp_(edges[1::2], shares[1])
-        torch.lerp(*faces, shares[0], out=value)
+        torch.lerp(faces[0], faces[1], shares[0], out=value)
 
 
 def _parts(image: Tensor, normalised: Tensor) -> int:

@@ -160,7 +160,8 @@ class LocalCrossCorrelation(Similarity):
         shape = tuple(warped.shape[2:])
 
         def products(rows: slice) -> Tensor:
-            return _products(*(t if t is None else t[:, :, rows] for t in (warped, self.fixed, windows.weight)))
+            weight = None if windows.weight is None else windows.weight[:, :, rows]
+            return _products(warped[:, :, rows], self.fixed[:, :, rows], weight)
 
         sums = box_sum_by_rows(products, shape, warped, self.window, self.stride).mul_(windows.inverse_count)
         warped_mean, square, product = sums.chunk(3, dim=1)

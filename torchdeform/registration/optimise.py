@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
 from time import perf_counter
 from typing import Any
 
@@ -121,12 +121,16 @@ class SimilarityTerm:
         return warped, *self.similarity.evaluate(warped.contiguous(), weighted(mask, self.fixed_mask))
 
     def _warped(self, images: Tensor, u: Tensor, transfer: Transfer | None) -> Tensor:
-        return warp(images, u, self.grid) if transfer is None else warp_by_rows(images, transfer.rows(u), self.grid)
+        return warp(images, u, self.grid) if transfer is None else warp_by_rows(images, transfer.up(u), self.grid)
 
-    def on_common_voxels(self, maps: Sequence[Tensor]) -> list[Tensor]:
+    def on_common_voxels(self, maps: Sequence[Tensor], transfer: Transfer | None = None) -> list[Tensor]:
         """Return S of the images warped by each of the maps ``(B, D, *S)``, over the voxels that all of them see."""
-        mask = common_mask(self.fixed_mask, self.masks, maps, self.grid)
-        return [self.similarity.evaluate(warp(self.images, u, self.grid), mask)[0] for u in maps]
+        if self.masks is None:
+            found = (self._warped(self.images, u, transfer) for u in maps)
+            return [self.similarity.evaluate(warped, self.fixed_mask)[0] for warped in found]
+        pairs = [self._warped(self._masked, u, transfer).tensor_split([-1], dim=1) for u in maps]
+        mask = reduce(lambda mask, pair: weighted(pair[1], mask), pairs, self.fixed_mask)
+        return [self.similarity.evaluate(warped.contiguous(), mask)[0] for warped, _ in pairs]
 
     @cached_property
     def _masked(self) -> Tensor:
@@ -186,10 +190,7 @@ class Addition:
 
     def on_common_voxels(self, maps: Sequence[Tensor]) -> list[Tensor]:
         """Return what is added for each of the maps, over the voxels that all of them see."""
-        return [self.weight * value for value in self.similarity.on_common_voxels([self._at(u) for u in maps])]
-
-    def _at(self, u: Tensor) -> Tensor:
-        return u if self.transfer is None else self.transfer.up(u)
+        return [self.weight * value for value in self.similarity.on_common_voxels(maps, self.transfer)]
 
 
 @dataclass(frozen=True)
@@ -208,9 +209,9 @@ class Objective:
     coupling: Coupling = _FREE
     more: tuple[Addition, ...] = ()
 
-    def on_common_voxels(self, maps: Sequence[Tensor], at_images: Sequence[Tensor]) -> list[Tensor]:
-        """Return S + Σ wₖ Sₖ of the maps, which are given on the grid of the images too, over what all of them see."""
-        values = self.similarity.on_common_voxels(at_images)
+    def on_common_voxels(self, maps: Sequence[Tensor], transfer: Transfer | None) -> list[Tensor]:
+        """Return S + Σ wₖ Sₖ of the maps, taken to the grid of the images, over what all of them see."""
+        values = self.similarity.on_common_voxels(maps, transfer)
         for addition in self.more:
             values = [value + other for value, other in zip(values, addition.on_common_voxels(maps), strict=True)]
         return values
@@ -269,10 +270,6 @@ class Level:
     def shape(self) -> tuple[int, ...]:
         """The grid of the level's images."""
         return self.objective.similarity.grid.shape
-
-    def at_images(self, u: Tensor) -> Tensor:
-        """Return the maps ``(B, D, *S)`` on the grid of the images."""
-        return u if self.transfer is None else self.transfer.up(u)
 
     def force(self, slope: Tensor, warped: Tensor) -> Tensor:
         """Return the `image_force` on the grid of the map."""
@@ -433,7 +430,7 @@ def best_map(
         maps: displacements ``(B, D, *S)``; of equal ones the last is returned.
         level: whose maps they are; None for maps on the grid of the images.
     """
-    values = objective.on_common_voxels(maps, [level.at_images(u) if level else u for u in maps])
+    values = objective.on_common_voxels(maps, level and level.transfer)
     goals = values
     if objective.landmarks:
         distances = [objective.landmarks.evaluate(u).distance for u in maps]
