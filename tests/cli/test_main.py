@@ -17,7 +17,7 @@ from torchdeform.io import write_displacement, write_image
 from torchdeform.io.transforms import write_transform
 from torchdeform.pipeline.config import preset_names
 
-LINES, COLUMNS = 40, 100
+LINES, COLUMNS = 42, 100
 
 
 @pytest.fixture

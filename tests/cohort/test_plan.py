@@ -226,3 +226,29 @@ def test_subjects_and_names_of_patterns_stay_inside_and_short(touch, cohort_of, 
         inside = job.files.out.relative_to(tmp_path / "results")
         assert ".." not in inside.parts
         assert all(len(part) <= 250 for part in inside.parts)
+
+
+def test_features_and_labels_that_pull_need_their_files(touch, cohort_of, tmp_path):
+    touch(["a.png", "b.png", "fa.png", "fb.png", "net.ts"])
+    rows = [
+        "name,fixed,moving,fixed_features,moving_features,settings.features,settings.labels_weight",
+        "files,a.png,b.png,fa.png,fb.png,,",
+        "program,a.png,b.png,,,net.ts,",
+        "twice,a.png,b.png,fa.png,fb.png,mind,",
+        "none,a.png,b.png,,,missing.ts,",
+        "labels,a.png,b.png,,,,1",
+        "one,a.png,b.png,fa.png,,,",
+    ]
+    (tmp_path / "t.csv").write_text("\n".join(rows), encoding="utf-8")
+    work = plan(cohort_of("pairs: {table: {file: t.csv}}\n"))
+    assert [job.name for job in work.jobs] == ["files", "program"]
+    assert work.jobs[0].files.moving_features == tmp_path / "fb.png"
+    assert work.jobs[1].settings.features == str(tmp_path / "net.ts")  # seen from the cohort's file
+    sentences = {problem.name: problem.sentence for problem in work.problems}
+    assert "features are given twice" in sentences["twice"]
+    assert f"{tmp_path / 'missing.ts'} does not exist" in sentences["none"]
+    assert "labels_weight needs labels of both images" in sentences["labels"]
+    assert "fixed_features needs moving_features too" in sentences["one"]
+    pattern = "{files: '{n}.png', parts: {n: '[ab]'}, features: 'f{n}.png', pairing: consecutive}"
+    (job,) = plan(cohort_of(f"pairs: {{pattern: {pattern}}}\n")).jobs
+    assert (job.files.fixed_features, job.files.moving_features) == (tmp_path / "fa.png", tmp_path / "fb.png")

@@ -79,3 +79,9 @@ def test_wrong_input_is_refused():
             DeformableRegistration(GRIDS[0], settings=settings_of(similarity=similarity))
     with pytest.raises(InputError, match="fixed must have shape"):
         DeformableRegistration(GRIDS[0])(torch.zeros(1, 1, 4, 4), torch.zeros(1, 1, 4, 4))
+
+
+def test_features_and_labels_are_for_whole_registrations():
+    for settings in ({"features": "mind"}, {"labels_weight": 1.0}):
+        with pytest.raises(InputError, match="features and labels_weight are for register"):
+            DeformableRegistration(Grid((16, 16)), settings=settings_of(**settings))

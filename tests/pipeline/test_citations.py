@@ -30,6 +30,9 @@ def test_entries_are_whole(key, entry):
 
 
 def test_every_entry_is_cited_by_some_settings():
+    assert set(citations(settings_of(features="mind", similarity="ssd"))) - set(
+        citations(settings_of(similarity="ssd"))
+    ) == {"heinrich2013towards"}
     several = settings_of(similarity=dict.fromkeys(MEASURES, 1.0), start="discrete")
     assert set(citations(several)) == set(bibliography())
 

@@ -1,13 +1,17 @@
 """Labels from file to file: what is written is what was measured, every label and its type is kept."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import SimpleITK as sitk
+import torch
+from programs import CONVOLUTIONS, save_script
 
-from torchdeform.cli.main import main
-from torchdeform.io.images import read_labels
+from torchdeform.cli.main import main, torchdeform
+from torchdeform.core.intensities import to_common_scale
+from torchdeform.io.images import read_image, read_labels, write_image
 
 SHAPES = {2: (40, 44), 3: (16, 18, 20)}
 
@@ -52,6 +56,68 @@ def test_what_is_written_is_what_was_measured(folder):
         both = [labels == float(label) for labels in (fixed, warped.data)]
         assert value == pytest.approx(2 * float((both[0] & both[1]).sum()) / float(both[0].sum() + both[1].sum()))
         assert value > 0.9
+
+
+def test_labels_that_pull_overlap_more_and_are_said_to_have_been_in_the_cost(folder, capsys):
+    pair = ["fixed.nrrd", "moving.nrrd", "--preset", "fast", "--align", "none"]
+    labels = ["--fixed-labels", "fixed_labels.nrrd", "--moving-labels", "moving_labels.nrrd"]
+    found = []
+    for weight in (0, 3):
+        assert main([*pair, *labels, "--set", f"labels_weight={weight}", "--out", f"out{weight}"]) == 0
+        record = json.loads((folder / f"out{weight}" / "result.json").read_text(encoding="utf-8"))
+        assert record["labels_in_cost"] == bool(weight)
+        said = [
+            capsys.readouterr().out,
+            (folder / f"out{weight}" / "report.html").read_text(encoding="utf-8"),
+            record["verdict"]["findings"][-1]["text"] + str(record["verdict"]["findings"]),
+        ]
+        assert [" in the cost" in text for text in said] == [bool(weight)] * 3
+        found.append(record["evaluation"]["after"]["dice_mean"])
+    assert found[1] > found[0]
+    assert main([*pair, "--set", "labels_weight=1", "--out", "none"]) == 2
+    assert "give --fixed-labels and --moving-labels" in capsys.readouterr().err
+    assert not (folder / "none").exists()
+
+
+def test_features_of_a_program_and_of_files_are_the_same(folder, capsys):
+    """A program that adds 1 to the scaled image and its square, and the files that it would have made."""
+    dim = sitk.ReadImage("fixed.nrrd").GetDimension()
+    net = CONVOLUTIONS[dim](1, 2, 1).eval()
+    save_script(net, folder / "net.ts")
+    pair = ["fixed.nrrd", "moving.nrrd", "--preset", "fast", "--align", "none", "--set", "absent=off", "--quiet"]
+    assert main([*pair, "--set", "features=net.ts", "--out", "program"]) == 0
+    for name in ("fixed", "moving"):
+        image = read_image(f"{name}.nrrd")
+        scaled, _ = to_common_scale((image.data, image.data), (None, None), jointly=False)
+        with torch.no_grad():
+            write_image(replace(image, data=net(scaled)), f"{name}_features.nrrd")
+    files = ["--fixed-features", "fixed_features.nrrd", "--moving-features", "moving_features.nrrd"]
+    assert main([*pair, *files, "--out", "files"]) == 0
+    first, second = (
+        json.loads((folder / out / "result.json").read_text(encoding="utf-8")) for out in ("program", "files")
+    )
+    assert first["objective_after"] == pytest.approx(second["objective_after"], rel=1e-3)
+    assert first["objective_after"] > first["objective_before"]
+    assert [record["settings"]["features"] for record in (first, second)] == ["net.ts", "files"]
+    assert "ssd" in first["similarity_choice"]
+    assert torchdeform(["check", "fixed.nrrd", "moving.nrrd", *files]) == 0
+    capsys.readouterr()
+    for words, problem in (
+        ([*files[:2]], "--fixed-features needs --moving-features too"),
+        ([*files, "--set", "features=mind"], "features are given twice, by --fixed-features"),
+        ([*files[:3], "fixed.nrrd"], "fixed_features.nrrd has 2 channels and fixed.nrrd has 1 channels"),
+        (["--set", "features=missing.ts"], "missing.ts does not exist"),
+        (["--set", "features=fixed.nrrd"], "fixed.nrrd holds no program"),
+        (["--set", "features=files"], "there are none; give --fixed-features"),
+    ):
+        assert main([*pair, *words, "--out", "none"]) == 2
+        assert problem in capsys.readouterr().err
+        assert not (folder / "none").exists()
+    assert torchdeform(["check", "fixed.nrrd", "moving.nrrd", *files[:3], "fixed.nrrd"]) == 2
+    assert "features of both images must be the same channels" in capsys.readouterr().out
+    save_script(CONVOLUTIONS[5 - dim](1, 2, 1), folder / "other.ts")
+    assert main([*pair, "--set", "features=other.ts", "--out", "none"]) == 2
+    assert "other.ts" in capsys.readouterr().err
 
 
 def test_without_labels_nothing_is_said_of_them(folder):

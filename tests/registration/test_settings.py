@@ -1,6 +1,7 @@
 """Settings: frozen, and with a copy of their own of what they were given."""
 
 from dataclasses import FrozenInstanceError, asdict
+from pathlib import Path
 
 import pytest
 from nested_settings import settings_of
@@ -89,3 +90,39 @@ def test_kinds_of_tissue_cost_what_settings_may_say(kind):
 def test_tissue_that_cannot_be_is_named(values, said):
     with pytest.raises(InputError, match=said):
         settings_of(**values)
+
+
+def test_features_are_names_files_programs_or_several_with_weights():
+    def program(image):
+        return image
+
+    assert settings_of().sources == {}
+    assert not settings_of(features={"intensities": 1, "net.ts": 2}).only_features
+    alone = settings_of(features=program).decided()
+    assert (alone.similarity.measure, alone.seen_by, alone.maximised) == ("ssd", "lncc", "ssd of features")
+    several = settings_of(features={"intensities": 1, "net.ts": 0.5, "mind": 1}, labels_weight=2.0)
+    assert several.programs == ("net.ts",)
+    assert several.with_programs(lambda name: Path("/there") / name).sources["/there/net.ts"] == 0.5
+    assert settings_of(features="net.ts").with_programs(lambda name: Path("/a") / name).features == "/a/net.ts"
+    assert several.maximised == "lncc + features + labels"
+    for wrong, problem in (
+        ({"features": 3}, "features must be mind, a file of a program"),
+        ({"features": ""}, "features must be mind, a file of a program"),
+        ({"features": {"mind": 0.0}}, "features: the weight of mind must be a positive"),
+        ({"features": {"intensities": 1.0}}, "features: intensities alone"),
+        ({"features": "mind", "similarity": "mind"}, "similarity: mind makes features of its own"),
+        ({"labels_weight": -1.0}, "labels_weight must be finite and not negative"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            settings_of(**wrong)
+
+
+def test_features_in_layers_of_settings_take_the_place_of_others(tmp_path):
+    (tmp_path / "s.yaml").write_text("features: {intensities: 1, net.ts: 0.5}\nlabels_weight: 1\n", encoding="utf-8")
+    settings = load_settings(file=tmp_path / "s.yaml")
+    assert settings.features == {"intensities": 1, "net.ts": 0.5}
+    assert load_settings(file=tmp_path / "s.yaml", overrides={"features": {"mind": 1, "a.b": 2}}).features == {
+        "mind": 1,
+        "a.b": 2,
+    }
+    assert load_settings(file=tmp_path / "s.yaml", overrides={"features": None}).features is None

@@ -55,20 +55,13 @@ Fixed = Annotated[
 Moving = Annotated[Path, typer.Argument(metavar="MOVING", help="Image that is warped onto it.")]
 Align = Annotated[str | None, choice(ALIGNMENTS, "First: {} (usual).", "KIND", show_default=False)]
 PointsWeight = Annotated[
-    float | None, typer.Option(metavar="W", show_default="0", help="Weight of the landmarks against the similarity.")
-]
-LabelsWeight = Annotated[
-    float | None, typer.Option(metavar="W", show_default="0", help="Weight of the labels against the similarity.")
-]
-Features = Annotated[
-    str | None,
-    typer.Option(metavar="mind|FILE", show_default=False, help="Compare what a TorchScript program makes (it is run)."),
+    float | None, typer.Option(metavar="W", show_default="0", help="Weight of the landmarks in the cost.")
 ]
 Symmetric = Annotated[bool, flag("--symmetric", "Treat both images alike: swapping them inverts the map.")]
 Memory = Annotated[
     str | None, typer.Option(metavar="SIZE", show_default="what is free", help="Use at most this, such as 4GB.")
 ]
-Preset = Annotated[str, choice(preset_names(), "Start from {}.", show_default=False)]
+Preset = Annotated[str, choice(preset_names(), "From {}.", show_default=False)]
 Config = Annotated[
     Path | None, typer.Option(metavar="FILE", help="YAML file with settings that differ from the preset.")
 ]
@@ -90,8 +83,6 @@ def register(
     points_weight: PointsWeight = None,
     fixed_labels: FixedLabels = None,
     moving_labels: MovingLabels = None,
-    labels_weight: LabelsWeight = None,
-    features: Features = None,
     fixed_features: FixedFeatures = None,
     moving_features: MovingFeatures = None,
     tissue: Tissue = None,
@@ -114,13 +105,7 @@ def register(
     displacement.nii.gz, overview.png and result.json, all or none.
     """
     # Options that were not given must not override the preset and the file.
-    shortcuts = {
-        "align": align,
-        "points_weight": points_weight,
-        "labels_weight": labels_weight,
-        "features": features,
-        "symmetric": symmetric or None,
-    }
+    shortcuts = {"align": align, "points_weight": points_weight, "symmetric": symmetric or None}
     overrides = {key: value for key, value in shortcuts.items() if value is not None}
     settings = load_settings(preset, config, dict(map(parse_override, assignments or [])) | overrides)
     files = PairFiles(

@@ -9,7 +9,7 @@ from torch.utils.checkpoint import checkpoint
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import warp
-from torchdeform.errors import require_choice, require_ranges
+from torchdeform.errors import InputError, require_choice, require_ranges
 from torchdeform.metrics.similarity import MEASURES
 from torchdeform.nn.precision import full_precision
 from torchdeform.registration.optimise import Level, Objective, elasticity_of, optimise_level
@@ -27,7 +27,8 @@ class DeformableRegistration(nn.Module):
             said of levels, landmarks and ``symmetric`` are not looked at.
 
     Raises:
-        InputError: steps below 1, a similarity that is a mixture or compares features (``mind``).
+        InputError: steps below 1, a similarity that is a mixture or compares features (``mind``), or settings with
+            ``features`` or ``labels_weight``.
 
     Notes:
         The loop of `register` itself, on one level. Differentiable once in the images and in the start, through all
@@ -43,6 +44,8 @@ class DeformableRegistration(nn.Module):
         settings = settings or RegistrationSettings()
         # Others compare features, which are warped in place of the image.
         measures = [name for name, measure in MEASURES.items() if not measure.compares_features]
+        if settings.sources or settings.labels_weight > 0:
+            raise InputError("DeformableRegistration: features and labels_weight are for register; leave them out")
         settings = settings.decided()
         require_choice(settings.similarity.measure, measures, "DeformableRegistration: similarity")
         self.grid, self.steps, self.settings = grid, steps, settings

@@ -4,8 +4,9 @@ import re
 from pathlib import Path
 
 from torchdeform import __version__
+from torchdeform.metrics.similarity import MEASURES
 from torchdeform.pipeline.memory import choices
-from torchdeform.registration.settings import RegistrationSettings
+from torchdeform.registration.settings import MIND, RegistrationSettings
 
 # What every registration uses, and what some settings add; the keys are those of references.bib.
 _ALWAYS = {"torchdeform": "the software", "liu2007reconstruction": "the method", "liu2024finite": "what a fold is"}
@@ -22,6 +23,7 @@ def citations(settings: RegistrationSettings) -> dict[str, str]:
         Measures that are common property (``ssd``, ``ncc``) have no entry.
     """
     found, (measures, discrete, _) = dict(_ALWAYS), choices(settings)
+    measures = measures | ({"mind": MEASURES["mind"]} if MIND in settings.sources else {})
     for name, measure in measures.items():
         found |= dict.fromkeys(measure.references, f"similarity: {name}")
     if discrete:

@@ -27,9 +27,9 @@ _PER_ENTRY = 90
 # And of the map of each label that glides: as a share of the first map.
 _PER_SIDE = 0.65
 # And of each channel of features: per node, whatever the measure.
-_PER_FEATURE = {2: 45.0, 3: 40.0}
+_PER_FEATURE = {2: 30.0, 3: 25.0}
 # And of the labels that pull: per probability that is held of each image, of which there are at most so many a node.
-_PER_PROBABILITY, _PROBABILITIES = 16.0, 32
+_PER_PROBABILITY, _PROBABILITIES = 12.0, 32
 # And of reading, joining, judging and writing on the fixed grid, however coarse the finest level is.
 _FILES = {2: (65.0, 48.0), 3: (80.0, 26.0)}
 

@@ -10,7 +10,7 @@ from torchdeform.core.flow import OdeSolver
 from torchdeform.core.image import AUTO
 from torchdeform.errors import RANGES, InputError, require_choice, require_ranges, shown
 from torchdeform.fem.solver import SolverSettings
-from torchdeform.metrics.similarity import MEASURES, similarity_weights, weights_of
+from torchdeform.metrics.similarity import MEASURES, measure_name, similarity_weights, weights_of
 from torchdeform.registration.affine.settings import AlignmentSettings
 
 OFF = "off"
@@ -365,6 +365,12 @@ class RegistrationSettings:
     def seen_by(self) -> str | Mapping[str, float]:
         """The measure of the intensities, also where features take their place: what alignments and marks go by."""
         return "lncc" if self.only_features else self.similarity.measure
+
+    @property
+    def maximised(self) -> str:
+        """What is maximised, as one text: ``lncc + labels``."""
+        others = " of features" if self.only_features else " + features" if self.sources else ""
+        return f"{measure_name(self.similarity.measure)}{others}{' + labels' if self.labels_weight > 0 else ''}"
 
     @property
     def knows_tissue(self) -> bool:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchdeform.metrics.similarity import measure_name
 from torchdeform.registration.result import RegistrationResult
 from torchdeform.report.planes import Plane
 
@@ -196,7 +195,7 @@ def draw_convergence(axes: "Axes", result: RegistrationResult, *, item: int = 0)
         marker = "o-" if len(values) == 1 else "-"  # a single point makes no line
         axes.plot(range(start, start + len(values)), values, marker, label=size, linewidth=1.6, color=colour)
         start += max(len(values) - 1, 0)
-    _name_axes(axes, "step", measure_name(result.settings.similarity.measure))
+    _name_axes(axes, "step", result.settings.maximised)
     if result.levels:
         axes.legend(fontsize=8, frameon=False, loc="best")
 

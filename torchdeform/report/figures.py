@@ -97,7 +97,7 @@ def _draw_convergence(axes: "Axes", result: "RegistrationResult", width: float, 
     axes.set_box_aspect(height / (width - 0.45))
     draw_convergence(axes, result)
     axes.set_ylabel("")
-    title(axes, f"{measure_name(result.settings.similarity.measure)} over the steps")
+    title(axes, f"{result.settings.maximised} over the steps")
 
 
 def _title(panel: str, result: "RegistrationResult") -> str:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torchdeform.metrics.similarity import measure_name
 from torchdeform.registration.verdict import MARKS
 from torchdeform.report.contours import Lines
 from torchdeform.report.drawing import (
@@ -287,7 +286,7 @@ def _curves(data: ReportData) -> list[dict[str, object]]:
     """Return the histogram of volumes and the curve of the similarity over the steps."""
     from markupsafe import Markup
 
-    limit, measure = data.limits["log_det"], measure_name(data.result.settings.similarity.measure)
+    limit, measure = data.limits["log_det"], data.result.settings.maximised
     words = WORDS[data.result.grid.dim]
     about_volumes = "How often each change of {volume} occurs, over all {voxel}s.".format(**words)
     about_steps = f"Similarity ({measure}) over the steps, by level."
