@@ -1,0 +1,411 @@
+"""Judge settings on all sets of real images at once, and choose one without looking at the subject it is judged on.
+
+    python scripts/benchmarks/accuracy.py --json accuracy.json \\
+        --settings "long=optimiser.steps=[80,60,48]" "fine=optimiser.map_spacing=1,optimiser.steps=[80,60,48]"
+    python scripts/benchmarks/accuracy.py --json accuracy.json --sets brain_t1_3d --shrink 2 --peers greedy ants_syn
+    python scripts/benchmarks/accuracy.py --json accuracy.json --print
+
+A setting is ``NAME=PART,PART``, a part being ``key=value`` or a preset, ``default`` if there is none; a preset's name
+alone will do. Those of ``--settings`` may become the default; those of ``--beside``, which have another price in time,
+and the tools of ``--peers`` are only shown. Every pair is registered from ``--jitters`` starts: the alignment is found
+once, and moved by a random tenth of a voxel along each axis (normal, seeded by pair and jitter). Other tools, which
+align for themselves, get a moving image whose origin is moved as far. The alignment is not jittered because its search
+begins at the centres of the images and takes a shift of the file back to the last digit.
+
+The choice is made as `held_out` says: one setting for all sets, for each pair by all pairs that show neither of its
+subjects. The default would change if all pairs together prefer another setting and the held-out mean rises.
+
+Runs are kept in the JSON file by pair, settings, jitter, device and the code of the package, and not done again, so a
+long benchmark can be made in pieces. Labels are warped to the nearest voxel by one code for all.
+"""
+
+import argparse
+import hashlib
+import json
+import multiprocessing
+import os
+import re
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from statistics import mean, stdev
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from held_out import DEFAULT, Score, choose, chosen_without, gain, standard_error
+from judge import quality, to_array
+from machine import describe_machine
+from pairs import SETS, Pair
+from peer_tools import TOOLS
+from peers import Book, Row, about, prepare, run_in_folder
+from reading import images
+
+import torchdeform as td
+from torchdeform.core.transform import Affine
+from torchdeform.io.images import read_optional
+from torchdeform.pipeline.config import parse_override, preset_names
+from torchdeform.registration.placement import place
+
+# Raise it when pairs, starts, painting or judgement change.
+PROTOCOL = 1
+
+# Standard deviation of a start, in voxels along each axis.
+_JITTER = 0.1
+
+CANDIDATES = (
+    "long=optimiser.steps=[80,60,48]",
+    "patient=optimiser.tolerance=0.01",
+    "fine=optimiser.map_spacing=1",
+    "smoother=metric.length_scale=[8,6,4]",
+)
+BESIDE = ("fast", "accurate")
+
+# What the table shows of a figure.
+_FIGURES = {
+    "Dice": ("dice", ".4f"),
+    "all labels as one": ("union", ".4f"),
+    "landmarks, mean": ("landmark_mean", ".3f"),
+    "landmarks, median": ("landmark_median", ".3f"),
+}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A candidate: a preset and what is changed of it."""
+
+    name: str
+    preset: str = DEFAULT
+    changes: dict[str, object] = field(default_factory=dict, hash=False)
+
+    @classmethod
+    def parse(cls, text: str) -> "Setting":
+        """Read ``NAME=PART,PART`` or the name of a preset; commas in brackets part nothing."""
+        name, equals, rest = text.partition("=")
+        parts = re.split(r",(?![^\[{]*[\]}])", rest) if equals else [name]
+        presets = [part for part in parts if "=" not in part]
+        changes = dict(parse_override(part) for part in parts if "=" in part)
+        return cls(name, presets[-1] if presets else DEFAULT, changes)
+
+    def load(self) -> td.RegistrationSettings:
+        return td.load_settings(self.preset, None, self.changes)
+
+    @property
+    def key(self) -> str:
+        """A digest of all values."""
+        return _digest(json.dumps(asdict(self.load()), sort_keys=True, default=str).encode())
+
+
+@dataclass(frozen=True)
+class Task:
+    """Runs of one setting on one pair from several starts; ``key`` is what they have in common in the file."""
+
+    pair: Pair
+    setting: Setting
+    jitters: tuple[int, ...]
+    key: Row = field(hash=False)
+
+
+def _digest(*contents: bytes) -> str:
+    digest = hashlib.sha256()
+    for content in contents:
+        digest.update(content)
+    return digest.hexdigest()[:12]
+
+
+@lru_cache
+def _code() -> str:
+    """Return a digest of the package's code."""
+    return _digest(*(path.read_bytes() for path in sorted(Path(td.__file__).parent.rglob("*.py"))))
+
+
+@lru_cache(maxsize=1)
+def _images(pair: Pair, shrink: float) -> tuple[td.Image, td.Image]:
+    return images(pair, shrink)
+
+
+def shift(pair: Pair, moving: td.Image, jitter: int) -> tuple[float, ...]:
+    """Return how far a start is moved in the world, (x, y, z)."""
+    drawn = np.random.default_rng([zlib.crc32(pair.name.encode()), jitter]).standard_normal(moving.grid.dim)
+    return tuple((np.array(moving.direction) @ (_JITTER * drawn * moving.grid.spacing[::-1])).tolist())
+
+
+def measure(task: Task) -> list[Row]:
+    """Align a pair, register it from each start, and judge the maps."""
+    key, pair = task.key, task.pair
+    fixed, moving = (image.to(key["device"]) for image in _images(pair, key["shrink"]))
+    masks = (read_optional(path) for path in (pair.fixed_mask, pair.moving_mask))
+    known = td.Annotations(**_present(zip(("fixed_mask", "moving_mask"), masks, strict=True), key["device"]))
+    began, rows = perf_counter(), []
+    placed = place(fixed, moving, task.setting.load(), known)
+    aligned = perf_counter() - began
+    for jitter in task.jitters:
+        step = torch.tensor(shift(pair, moving, jitter), dtype=torch.float64)
+        there = placed.affine or Affine.identity(fixed.grid.dim)
+        start = replace(placed, affine=Affine(there.matrix, there.offset + step))
+        began = perf_counter()
+        result = td.register(fixed, moving, placed.settings, annotations=known, affine=start)
+        seconds = aligned + perf_counter() - began
+        figures = {"seconds": seconds, "folds": float(result.diagnosis.folds)}
+        rows.append(key | {"jitter": jitter} | figures | quality(pair, fixed.to("cpu"), _positions(fixed, result)))
+    return rows
+
+
+def _present(named: Iterable[tuple[str, td.Image | None]], device: str) -> dict[str, Any]:
+    return {name: image.to(device) for name, image in named if image is not None}
+
+
+def _positions(fixed: td.Image, result: td.RegistrationResult) -> np.ndarray:
+    u = result.displacement.double().cpu()
+    there = fixed.to_world(fixed.grid.points(dtype=torch.float64) + u)
+    return to_array(there if result.affine is None else result.affine(there))
+
+
+def attempt(task: Task) -> list[Row]:
+    """As `measure`; a run that fails says why."""
+    try:
+        return measure(task)
+    except (td.InputError, td.ComputationError, torch.OutOfMemoryError) as error:
+        return [task.key | {"jitter": jitter, "failed": str(error)} for jitter in task.jitters]
+
+
+def keys(options: argparse.Namespace) -> Iterator[tuple[str, Pair, str, Row]]:
+    """Yield set, pair, name of the setting or tool, and what its runs have in common, pair by pair."""
+    common = {"protocol": PROTOCOL, "shrink": options.shrink}
+    ours = {s.name: {"tool": "torchdeform", "settings": s.key, "code": _code()} for s in options.all_settings}
+    ours = {name: key | {"device": options.device} for name, key in ours.items()}
+    theirs = {name: {"tool": name, "settings": TOOLS[name].settings} for name in options.peers}
+    for which in options.sets:
+        for pair in SETS[which](options.data)[: options.pairs]:
+            for name, key in (ours | theirs).items():
+                yield which, pair, name, {"set": which, "pair": pair.name} | common | key
+
+
+def missing(options: argparse.Namespace, book: Book) -> tuple[list[Task], list[tuple[Pair, str, Row]]]:
+    """Return what is to be run of ours, and of others."""
+    settings, tasks, others = {s.name: s for s in options.all_settings}, [], []
+    for _, pair, name, key in keys(options):
+        jitters = tuple(j for j in range(options.jitters) if not book.holds(key | {"jitter": j}))
+        if jitters and name in settings:
+            tasks.append(Task(pair, settings[name], jitters, key))
+        elif name not in settings:
+            others += [(pair, name, key | {"jitter": j}) for j in jitters]
+    return tasks, others
+
+
+def run(options: argparse.Namespace, book: Book) -> None:
+    """Run what the book does not hold yet: ours in processes side by side, the others one by one."""
+    tasks, others = missing(options, book)
+    torch.set_num_threads(options.threads)
+    if options.workers == 1:
+        for task in tasks:
+            _keep(book, attempt(task))
+    else:
+        start = {"mp_context": multiprocessing.get_context("spawn"), "initializer": torch.set_num_threads}
+        with ProcessPoolExecutor(options.workers, initargs=(options.threads,), **start) as pool:
+            for rows in pool.map(attempt, tasks):
+                _keep(book, rows)
+    for pair, name, key in others:
+        _keep(book, [key | about(name) | _run_peer(name, pair, key, options)])
+
+
+def _keep(book: Book, rows: Iterable[Row]) -> None:
+    for row in rows:
+        book.add({"machine": describe_machine()} | row)
+
+
+def _run_peer(name: str, pair: Pair, key: Row, options: argparse.Namespace) -> Row:
+    by = shift(pair, images(pair, options.shrink)[1], key["jitter"])
+    with TemporaryDirectory() as folder:
+        job = replace(prepare(pair, Path(folder), options.shrink, by), device=options.device, threads=options.threads)
+        return run_in_folder(name, pair, job, options.limit, by)
+
+
+class Table:
+    """The runs of each setting or tool on each pair.
+
+    Args:
+        options: which sets, settings, tools and starts.
+        book: all runs.
+    """
+
+    def __init__(self, options: argparse.Namespace, book: Book) -> None:
+        self.rows: dict[tuple[str, str, str], list[Row]] = {}
+        self.pairs: dict[tuple[str, str], Pair] = {}
+        for which, pair, name, key in keys(options):
+            own = [row for row in book.rows if key.items() <= row.items() and row["jitter"] < options.jitters]
+            self.pairs[which, pair.name] = pair
+            if len(own) == options.jitters and not any("failed" in row for row in own):
+                self.rows[which, pair.name, name] = own
+
+    def scores(self, names: Sequence[str], which: str | None = None) -> list[Score]:
+        """Return the pairs, of one set or of all, that every one of some settings has registered."""
+        return [
+            Score(pair.fixed.parent.name, *place, frozenset(pair.subjects), {n: self._error(place, n) for n in names})
+            for place, pair in self.pairs.items()
+            if which in (None, place[0]) and all((*place, name) in self.rows for name in names)
+        ]
+
+    def of(self, which: str, name: str) -> list[list[Row]]:
+        """Return the runs of a setting on a set, by pair."""
+        return [rows for (where, _, who), rows in self.rows.items() if (where, who) == (which, name)]
+
+    def _error(self, place: tuple[str, str], name: str) -> float:
+        return mean(map(error, self.rows[*place, name]))
+
+
+def error(row: Row) -> float:
+    """Return what is to be small: 1 − Dice, or the distance of the landmarks."""
+    return 1 - row["dice"] if "dice" in row else row["landmark_mean"]
+
+
+def _number(value: float, spread: float | None, how: str = "+.4f") -> str:
+    return format(value, how) + ("" if spread is None else f" ± {spread:{how.replace('+', '')}}")
+
+
+def shown(table: Table, options: argparse.Namespace) -> str:
+    """Return a line for each set and setting or tool, as Markdown."""
+    columns = ("set", "setting", "pairs", *_FIGURES, "gain on default ± SE", "sd of starts", "folds", "seconds")
+    lines = ["| " + " | ".join((*columns, "times default")) + " |", "|---" * (len(columns) + 1) + "|"]
+    for which in options.sets:
+        for name in (*(s.name for s in options.all_settings), *options.peers):
+            if runs := table.of(which, name):
+                lines.append("| " + " | ".join([which, name, *_cells(table, which, name, runs)]) + " |")
+    return "\n".join(lines)
+
+
+def _cells(table: Table, which: str, name: str, runs: list[list[Row]]) -> list[str]:
+    rows, scores = [row for own in runs for row in own], table.scores((DEFAULT, name), which)
+    figures = [format(mean(row[key] for row in rows), how) if key in rows[0] else "" for key, how in _FIGURES.values()]
+    spread = mean(stdev(map(error, own)) for own in runs) if len(runs[0]) > 1 else 0.0
+    usual = [row["seconds"] for own in table.of(which, DEFAULT) for row in own]
+    seconds = mean(row["seconds"] for row in rows)
+    ratio = f"{seconds / mean(usual):.2f}" if usual else ""
+    gained = _gained(scores, dict.fromkeys(((s.set, s.pair) for s in scores), name)) if scores else ""
+    folds = f"{max(row['folds'] for row in rows):.0f}"
+    return [str(len(runs)), *figures, gained, f"{spread:.4f}", folds, f"{seconds:.2f}", ratio]
+
+
+def _gained(scores: Sequence[Score], chosen: dict[tuple[str, str], str]) -> str:
+    """Return how much smaller the error is than that of the default, in the set's own unit."""
+
+    def won(some: Sequence[Score]) -> float:
+        return mean(s.errors[DEFAULT] - s.errors[chosen[s.set, s.pair]] for s in some)
+
+    return _number(won(scores), standard_error(scores, won))
+
+
+def verdict(table: Table, options: argparse.Namespace) -> str:
+    """Return what is chosen for whom, what that gains, and whether the default would change, as Markdown."""
+    places, names = list(table.pairs), [s.name for s in options.settings]
+    whole = [name for name in names if all((*place, name) in table.rows for place in places)]
+    if DEFAULT not in whole or len(whole) < 2:
+        return "Nothing to choose: the default and another setting must have registered every pair."
+    scores = table.scores(whole)
+    chosen, best = chosen_without(scores, whole), choose(scores, whole)
+    lines = [
+        "| set | default | held out | gain ± SE | chosen without the subjects | best in hindsight |",
+        "|---" * 6 + "|",
+    ]
+    for which in options.sets:
+        own = [score for score in scores if score.set == which]
+        lines.append("| " + " | ".join([which, *_choice(table, own, chosen, whole)]) + " |")
+
+    def won(some: Sequence[Score]) -> float:
+        return gain(some, lambda score: chosen[score.set, score.pair])
+
+    rise, counts = won(scores), Counter(chosen.values())
+    lines += [
+        "",
+        f"Held-out gain over all sets: {_number(rise, standard_error(scores, won), '+.2%')} of the default's error.",
+    ]
+    lines += [
+        f"Left out of the choice, as not every pair was registered: {name}." for name in names if name not in whole
+    ]
+    changes = best != DEFAULT and rise > 0
+    word = f"would change to {best}" if changes else "stays"
+    votes = ", ".join(f"{name} {count}" for name, count in counts.most_common())
+    return "\n".join([*lines, f"The default {word} (all pairs prefer {best}; by pair: {votes})."])
+
+
+def _choice(
+    table: Table, scores: Sequence[Score], chosen: dict[tuple[str, str], str], names: Sequence[str]
+) -> list[str]:
+    """Return the cells of a set: its figure by default and held out, the gain, who got what, the best in hindsight."""
+
+    def figure(errors: Iterable[float]) -> str:
+        value = mean(errors)
+        return f"{1 - value:.4f}" if overlap else f"{value:.3f}"
+
+    overlap = "dice" in table.of(scores[0].set, DEFAULT)[0][0]
+    best = min(names, key=lambda name: mean(s.errors[name] for s in scores))
+    given: dict[str, list[str]] = {}
+    for score in scores:
+        given.setdefault(chosen[score.set, score.pair], []).append(score.pair)
+    told = [f"{name}: {', '.join(who) if len(given) > 1 else 'all'}" for name, who in given.items()]
+    return [
+        figure(s.errors[DEFAULT] for s in scores),
+        figure(s.errors[chosen[s.set, s.pair]] for s in scores),
+        _gained(scores, chosen),
+        "; ".join(told),
+        f"{best} {figure(s.errors[best] for s in scores)}",
+    ]
+
+
+def failures(options: argparse.Namespace, book: Book) -> list[str]:
+    """Return a sentence for each setting or tool that failed on a pair."""
+    found = {}
+    for which, pair, name, key in keys(options):
+        for row in book.rows:
+            if "failed" in row and key.items() <= row.items():
+                found[f"{which}, {pair.name}, {name}: {row['failed']}"] = None
+    return list(found)
+
+
+def parse() -> argparse.Namespace:
+    """Return the options; ``all_settings`` are the default, the candidates, and those beside."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", nargs="?", default=os.environ.get("TORCHDEFORM_DATA", "../shared/data"), type=Path)
+    parser.add_argument("--sets", nargs="+", default=list(SETS), choices=list(SETS))
+    parser.add_argument("--settings", nargs="*", default=list(CANDIDATES), help="candidates besides the default")
+    parser.add_argument("--beside", nargs="*", default=list(BESIDE), help="settings that are only shown")
+    parser.add_argument("--peers", nargs="*", default=[], choices=list(TOOLS), help="other tools")
+    parser.add_argument("--jitters", type=int, default=3, help="starts of each pair")
+    parser.add_argument("--shrink", type=float, default=1, help="how much coarser whole brains are made, 2 for trials")
+    parser.add_argument("--pairs", type=int, help="at most so many of each set")
+    parser.add_argument("--json", type=Path, help="file of all runs; runs that it has are not done again")
+    parser.add_argument("--retry", action="store_true", help="run again what failed")
+    parser.add_argument("--print", action="store_true", help="only print what the file has")
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
+    parser.add_argument("--workers", type=int, default=1, help="pairs that are registered side by side")
+    parser.add_argument("--threads", type=int, default=1, help="of each")
+    parser.add_argument("--limit", type=float, default=3600, help="seconds that another tool may take")
+    options = parser.parse_args()
+    options.settings = [Setting.parse(text) for text in dict.fromkeys((DEFAULT, *options.settings))]
+    options.all_settings = [*options.settings, *(Setting.parse(text) for text in options.beside)]
+    unknown = {s.preset for s in options.all_settings} - set(preset_names())
+    if unknown:
+        parser.error(f"no preset is called {', '.join(unknown)}; write NAME=key=value, or a preset of {preset_names()}")
+    return options
+
+
+def main() -> None:
+    """Run what is missing and print the tables."""
+    options = parse()
+    book = Book(options.json)
+    if options.retry:
+        book.rows = [row for row in book.rows if "failed" not in row]
+    if not options.print:
+        run(options, book)
+    table = Table(options, book)
+    print(shown(table, options), verdict(table, options), *failures(options, book), sep="\n\n")
+
+
+if __name__ == "__main__":
+    main()
