@@ -72,11 +72,11 @@ def _spine(data: Path) -> list[Pair]:
 def _lung(*, masks: bool) -> Make:
     def make(data: Path) -> list[Pair]:
         folder = data / "lung_ct_3d"
-        files = [
-            folder / f"{side}{end}" for end in (".mha", "_points.txt", "_mask.mha") for side in ("fixed", "moving")
-        ]
-        pair = Pair("lung", *files[:2], None, None, *files[2:], subjects=(folder.name,))
-        return [pair if masks else replace(pair, fixed_mask=None, moving_mask=None)]
+        pair = Pair("lung", folder / "fixed.mha", folder / "moving.mha", subjects=(folder.name,))
+        points = [folder / f"{side}_points.txt" for side in ("fixed", "moving")]
+        pair = replace(pair, fixed_points=points[0], moving_points=points[1])
+        seen = [folder / f"{side}_mask.mha" for side in ("fixed", "moving")]
+        return [replace(pair, fixed_mask=seen[0], moving_mask=seen[1]) if masks else pair]
 
     return make
 
