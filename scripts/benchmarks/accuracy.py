@@ -26,20 +26,19 @@ import multiprocessing
 import os
 import re
 import zlib
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from statistics import mean, stdev
 from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 import torch
-from held_out import DEFAULT, Score, choose, chosen_without, gain, standard_error
+from accuracy_tables import Run, Table, shown, verdict
+from held_out import DEFAULT
 from judge import quality, to_array
 from machine import describe_machine
 from pairs import SETS, Pair
@@ -50,7 +49,7 @@ from reading import images
 import torchdeform as td
 from torchdeform.core.transform import Affine
 from torchdeform.io.images import read_optional
-from torchdeform.pipeline.config import parse_override, preset_names
+from torchdeform.pipeline.config import parse_override
 from torchdeform.registration.placement import place
 
 # Raise it when pairs, starts, painting or judgement change.
@@ -66,14 +65,6 @@ CANDIDATES = (
     "smoother=metric.length_scale=[8,6,4]",
 )
 BESIDE = ("fast", "accurate")
-
-# What the table shows of a figure.
-_FIGURES = {
-    "Dice": ("dice", ".4f"),
-    "all labels as one": ("union", ".4f"),
-    "landmarks, mean": ("landmark_mean", ".3f"),
-    "landmarks, median": ("landmark_median", ".3f"),
-}
 
 
 @dataclass(frozen=True)
@@ -146,8 +137,8 @@ def measure(task: Task) -> list[Row]:
     placed = place(fixed, moving, task.setting.load(), known)
     aligned = perf_counter() - began
     for jitter in task.jitters:
-        step = torch.tensor(shift(pair, moving, jitter), dtype=torch.float64)
         there = placed.affine or Affine.identity(fixed.grid.dim)
+        step = torch.tensor(shift(pair, moving, jitter)).to(there.offset)
         start = replace(placed, affine=Affine(there.matrix, there.offset + step))
         began = perf_counter()
         result = td.register(fixed, moving, placed.settings, annotations=known, affine=start)
@@ -175,8 +166,8 @@ def attempt(task: Task) -> list[Row]:
         return [task.key | {"jitter": jitter, "failed": str(error)} for jitter in task.jitters]
 
 
-def keys(options: argparse.Namespace) -> Iterator[tuple[str, Pair, str, Row]]:
-    """Yield set, pair, name of the setting or tool, and what its runs have in common, pair by pair."""
+def keys(options: argparse.Namespace) -> Iterator[Run]:
+    """Yield what is asked for, pair by pair."""
     common = {"protocol": PROTOCOL, "shrink": options.shrink}
     ours = {s.name: {"tool": "torchdeform", "settings": s.key, "code": _code()} for s in options.all_settings}
     ours = {name: key | {"device": options.device} for name, key in ours.items()}
@@ -209,8 +200,8 @@ def run(options: argparse.Namespace, book: Book) -> None:
     else:
         start = {"mp_context": multiprocessing.get_context("spawn"), "initializer": torch.set_num_threads}
         with ProcessPoolExecutor(options.workers, initargs=(options.threads,), **start) as pool:
-            for rows in pool.map(attempt, tasks):
-                _keep(book, rows)
+            for done in as_completed([pool.submit(attempt, task) for task in tasks]):
+                _keep(book, done.result())
     for pair, name, key in others:
         _keep(book, [key | about(name) | _run_peer(name, pair, key, options)])
 
@@ -225,147 +216,6 @@ def _run_peer(name: str, pair: Pair, key: Row, options: argparse.Namespace) -> R
     with TemporaryDirectory() as folder:
         job = replace(prepare(pair, Path(folder), options.shrink, by), device=options.device, threads=options.threads)
         return run_in_folder(name, pair, job, options.limit, by)
-
-
-class Table:
-    """The runs of each setting or tool on each pair.
-
-    Args:
-        options: which sets, settings, tools and starts.
-        book: all runs.
-    """
-
-    def __init__(self, options: argparse.Namespace, book: Book) -> None:
-        self.rows: dict[tuple[str, str, str], list[Row]] = {}
-        self.pairs: dict[tuple[str, str], Pair] = {}
-        for which, pair, name, key in keys(options):
-            own = [row for row in book.rows if key.items() <= row.items() and row["jitter"] < options.jitters]
-            self.pairs[which, pair.name] = pair
-            if len(own) == options.jitters and not any("failed" in row for row in own):
-                self.rows[which, pair.name, name] = own
-
-    def scores(self, names: Sequence[str], which: str | None = None) -> list[Score]:
-        """Return the pairs, of one set or of all, that every one of some settings has registered."""
-        return [
-            Score(pair.fixed.parent.name, *place, frozenset(pair.subjects), {n: self._error(place, n) for n in names})
-            for place, pair in self.pairs.items()
-            if which in (None, place[0]) and all((*place, name) in self.rows for name in names)
-        ]
-
-    def of(self, which: str, name: str) -> list[list[Row]]:
-        """Return the runs of a setting on a set, by pair."""
-        return [rows for (where, _, who), rows in self.rows.items() if (where, who) == (which, name)]
-
-    def _error(self, place: tuple[str, str], name: str) -> float:
-        return mean(map(error, self.rows[*place, name]))
-
-
-def error(row: Row) -> float:
-    """Return what is to be small: 1 − Dice, or the distance of the landmarks."""
-    return 1 - row["dice"] if "dice" in row else row["landmark_mean"]
-
-
-def _number(value: float, spread: float | None, how: str = "+.4f") -> str:
-    return format(value, how) + ("" if spread is None else f" ± {spread:{how.replace('+', '')}}")
-
-
-def shown(table: Table, options: argparse.Namespace) -> str:
-    """Return a line for each set and setting or tool, as Markdown."""
-    columns = ("set", "setting", "pairs", *_FIGURES, "gain on default ± SE", "sd of starts", "folds", "seconds")
-    lines = ["| " + " | ".join((*columns, "times default")) + " |", "|---" * (len(columns) + 1) + "|"]
-    for which in options.sets:
-        for name in (*(s.name for s in options.all_settings), *options.peers):
-            if runs := table.of(which, name):
-                lines.append("| " + " | ".join([which, name, *_cells(table, which, name, runs)]) + " |")
-    return "\n".join(lines)
-
-
-def _cells(table: Table, which: str, name: str, runs: list[list[Row]]) -> list[str]:
-    rows, scores = [row for own in runs for row in own], table.scores((DEFAULT, name), which)
-    figures = [format(mean(row[key] for row in rows), how) if key in rows[0] else "" for key, how in _FIGURES.values()]
-    spread = mean(stdev(map(error, own)) for own in runs) if len(runs[0]) > 1 else 0.0
-    usual = [row["seconds"] for own in table.of(which, DEFAULT) for row in own]
-    seconds = mean(row["seconds"] for row in rows)
-    ratio = f"{seconds / mean(usual):.2f}" if usual else ""
-    gained = _gained(scores, dict.fromkeys(((s.set, s.pair) for s in scores), name)) if scores else ""
-    folds = f"{max(row['folds'] for row in rows):.0f}"
-    return [str(len(runs)), *figures, gained, f"{spread:.4f}", folds, f"{seconds:.2f}", ratio]
-
-
-def _gained(scores: Sequence[Score], chosen: dict[tuple[str, str], str]) -> str:
-    """Return how much smaller the error is than that of the default, in the set's own unit."""
-
-    def won(some: Sequence[Score]) -> float:
-        return mean(s.errors[DEFAULT] - s.errors[chosen[s.set, s.pair]] for s in some)
-
-    return _number(won(scores), standard_error(scores, won))
-
-
-def verdict(table: Table, options: argparse.Namespace) -> str:
-    """Return what is chosen for whom, what that gains, and whether the default would change, as Markdown."""
-    places, names = list(table.pairs), [s.name for s in options.settings]
-    whole = [name for name in names if all((*place, name) in table.rows for place in places)]
-    if DEFAULT not in whole or len(whole) < 2:
-        return "Nothing to choose: the default and another setting must have registered every pair."
-    scores = table.scores(whole)
-    chosen, best = chosen_without(scores, whole), choose(scores, whole)
-    lines = [
-        "| set | default | held out | gain ± SE | chosen without the subjects | best in hindsight |",
-        "|---" * 6 + "|",
-    ]
-    for which in options.sets:
-        own = [score for score in scores if score.set == which]
-        lines.append("| " + " | ".join([which, *_choice(table, own, chosen, whole)]) + " |")
-
-    def won(some: Sequence[Score]) -> float:
-        return gain(some, lambda score: chosen[score.set, score.pair])
-
-    rise, counts = won(scores), Counter(chosen.values())
-    lines += [
-        "",
-        f"Held-out gain over all sets: {_number(rise, standard_error(scores, won), '+.2%')} of the default's error.",
-    ]
-    lines += [
-        f"Left out of the choice, as not every pair was registered: {name}." for name in names if name not in whole
-    ]
-    changes = best != DEFAULT and rise > 0
-    word = f"would change to {best}" if changes else "stays"
-    votes = ", ".join(f"{name} {count}" for name, count in counts.most_common())
-    return "\n".join([*lines, f"The default {word} (all pairs prefer {best}; by pair: {votes})."])
-
-
-def _choice(
-    table: Table, scores: Sequence[Score], chosen: dict[tuple[str, str], str], names: Sequence[str]
-) -> list[str]:
-    """Return the cells of a set: its figure by default and held out, the gain, who got what, the best in hindsight."""
-
-    def figure(errors: Iterable[float]) -> str:
-        value = mean(errors)
-        return f"{1 - value:.4f}" if overlap else f"{value:.3f}"
-
-    overlap = "dice" in table.of(scores[0].set, DEFAULT)[0][0]
-    best = min(names, key=lambda name: mean(s.errors[name] for s in scores))
-    given: dict[str, list[str]] = {}
-    for score in scores:
-        given.setdefault(chosen[score.set, score.pair], []).append(score.pair)
-    told = [f"{name}: {', '.join(who) if len(given) > 1 else 'all'}" for name, who in given.items()]
-    return [
-        figure(s.errors[DEFAULT] for s in scores),
-        figure(s.errors[chosen[s.set, s.pair]] for s in scores),
-        _gained(scores, chosen),
-        "; ".join(told),
-        f"{best} {figure(s.errors[best] for s in scores)}",
-    ]
-
-
-def failures(options: argparse.Namespace, book: Book) -> list[str]:
-    """Return a sentence for each setting or tool that failed on a pair."""
-    found = {}
-    for which, pair, name, key in keys(options):
-        for row in book.rows:
-            if "failed" in row and key.items() <= row.items():
-                found[f"{which}, {pair.name}, {name}: {row['failed']}"] = None
-    return list(found)
 
 
 def parse() -> argparse.Namespace:
@@ -387,11 +237,15 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--threads", type=int, default=1, help="of each")
     parser.add_argument("--limit", type=float, default=3600, help="seconds that another tool may take")
     options = parser.parse_args()
-    options.settings = [Setting.parse(text) for text in dict.fromkeys((DEFAULT, *options.settings))]
-    options.all_settings = [*options.settings, *(Setting.parse(text) for text in options.beside)]
-    unknown = {s.preset for s in options.all_settings} - set(preset_names())
-    if unknown:
-        parser.error(f"no preset is called {', '.join(unknown)}; write NAME=key=value, or a preset of {preset_names()}")
+    try:
+        options.settings = [Setting.parse(text) for text in dict.fromkeys((DEFAULT, *options.settings))]
+        others = [Setting.parse(text) for text in options.beside]
+        names = [s.name for s in options.settings]
+        options.all_settings = [*options.settings, *(s for s in others if s.name not in names)]
+        for setting in options.all_settings:
+            setting.load()
+    except td.InputError as error:
+        parser.error(str(error))
     return options
 
 
@@ -403,8 +257,8 @@ def main() -> None:
         book.rows = [row for row in book.rows if "failed" not in row]
     if not options.print:
         run(options, book)
-    table = Table(options, book)
-    print(shown(table, options), verdict(table, options), *failures(options, book), sep="\n\n")
+    table = Table(keys(options), book.rows, options.jitters)
+    print(shown(table), verdict(table, [s.name for s in options.settings]), *table.failed, sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -86,7 +86,7 @@ def test_a_setting_that_fails_on_a_pair_is_named_and_not_chosen(options, monkeyp
     accuracy.main()
     told = capsys.readouterr().out
     assert "synthetic, 0 <- 1, some: it is too round" in told
-    assert "Left out of the choice, as not every pair was registered: some." in told
+    assert "Left out, as it did not register every pair: some." in told
 
 
 def test_each_start_is_moved_by_about_a_tenth_of_a_voxel(options, pairs, monkeypatch):
