@@ -74,19 +74,23 @@ def prepare(pair: Pair, folder: Path, shrink: float = 1, shift: Sequence[float] 
     from reading import images
 
     import torchdeform as td
-    from torchdeform.io.images import read_optional
+    from torchdeform.io.images import read_labels, write_labels
 
-    masks = [read_optional(path) for path in (pair.fixed_mask, pair.moving_mask)]
-    masks = [mask and replace(mask, data=(mask.data != 0).float(), pixel_type="uint8") for mask in masks]
-    seen = [replace(image, pixel_type="float32") for image in images(pair, shrink)]
-    files = {}
-    for name, image in zip(("fixed", "moving", "fixed_mask", "moving_mask"), (*seen, *masks), strict=True):
-        if image is not None:
-            by = shift if shift and name.startswith("moving") else [0.0] * image.grid.dim
-            files[name] = folder / f"{name}.nii"
-            moved = tuple(x + d for x, d in zip(image.origin, by, strict=True))
-            td.write_image(replace(image, origin=moved), files[name])
+    files: dict[str, Path] = {}
+    for side, image, by in zip(("fixed", "moving"), images(pair, shrink), ((), shift), strict=True):
+        files[side] = folder / f"{side}.nii"
+        td.write_image(_moved(image, by), files[side])
+        if source := getattr(pair, f"{side}_mask"):
+            mask = read_labels(source)
+            files[f"{side}_mask"] = folder / f"{side}_mask.nii"
+            counts = replace(mask, data=(mask.data != 0).float(), pixel_type="uint8")
+            write_labels(_moved(counts, by), files[f"{side}_mask"])
     return Job(files.pop("fixed"), files.pop("moving"), folder, **files)
+
+
+def _moved(image: Any, by: Sequence[float]) -> Any:
+    """Return an image elsewhere in the world."""
+    return replace(image, origin=tuple(x + d for x, d in zip(image.origin, by, strict=True))) if by else image
 
 
 def run_here(order: Row) -> Row:
