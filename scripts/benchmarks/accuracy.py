@@ -7,10 +7,14 @@
 
 A setting is ``NAME=PART,PART``, a part being ``key=value`` or a preset, ``default`` if there is none; a preset's name
 alone will do. Those of ``--settings`` may become the default; those of ``--beside``, which have another price in time,
-and the tools of ``--peers`` are only shown. Every pair is registered from ``--jitters`` starts: the alignment is found
-once, and moved by a random tenth of a voxel along each axis (normal, seeded by pair and jitter). Other tools, which
-align for themselves, get a moving image whose origin is moved as far. The alignment is not jittered because its search
-begins at the centres of the images and takes a shift of the file back to the last digit.
+and the tools of ``--peers`` are only shown. To judge a change of the package, run the script with the old code, and
+then with the new one and ``--settings before=@CODE``, which takes runs of the old code, named in its first line, from
+the file.
+
+Every pair is registered from ``--jitters`` starts: the alignment is found once, and moved by a random tenth of a voxel
+along each axis (normal, seeded by pair and jitter). Other tools, which align for themselves, get a moving image whose
+origin is moved as far. For ours that would do nothing: the alignment begins at the centres of the images and takes a
+shift of the file back to the last digit.
 
 The choice is made as `held_out` says: one setting for all sets, for each pair by all pairs that show neither of its
 subjects. The default would change if all pairs together prefer another setting and the held-out mean rises.
@@ -69,28 +73,38 @@ BESIDE = ("fast", "accurate")
 
 @dataclass(frozen=True)
 class Setting:
-    """A candidate: a preset and what is changed of it."""
+    """A candidate: a preset, what is changed of it, and the code that ran it before if it is not this one."""
 
     name: str
     preset: str = DEFAULT
     changes: dict[str, object] = field(default_factory=dict, hash=False)
+    code: str = ""
 
     @classmethod
     def parse(cls, text: str) -> "Setting":
         """Read ``NAME=PART,PART`` or the name of a preset; commas in brackets part nothing."""
         name, equals, rest = text.partition("=")
         parts = re.split(r",(?![^\[{]*[\]}])", rest) if equals else [name]
-        presets = [part for part in parts if "=" not in part]
+        codes = [part[1:] for part in parts if part.startswith("@")]
+        presets = [part for part in parts if "=" not in part and part[0] != "@"]
         changes = dict(parse_override(part) for part in parts if "=" in part)
-        return cls(name, presets[-1] if presets else DEFAULT, changes)
+        return cls(name, (presets or [DEFAULT])[-1], changes, "".join(codes))
 
     def load(self) -> td.RegistrationSettings:
         return td.load_settings(self.preset, None, self.changes)
 
     @property
-    def key(self) -> str:
-        """A digest of all values."""
-        return _digest(json.dumps(asdict(self.load()), sort_keys=True, default=str).encode())
+    def words(self) -> str:
+        """What is chosen, in words."""
+        return ", ".join([self.preset, *(f"{key}={value}" for key, value in sorted(self.changes.items()))])
+
+    @property
+    def key(self) -> Row:
+        """What tells its runs from those of others: all values, which older code may not know, and the code."""
+        if self.code:
+            return {"words": self.words, "code": self.code}
+        values = json.dumps(asdict(self.load()), sort_keys=True, default=str)
+        return {"settings": _digest(values.encode()), "code": _code()}
 
 
 @dataclass(frozen=True)
@@ -129,7 +143,7 @@ def shift(pair: Pair, moving: td.Image, jitter: int) -> tuple[float, ...]:
 
 def measure(task: Task) -> list[Row]:
     """Align a pair, register it from each start, and judge the maps."""
-    key, pair = task.key, task.pair
+    key, pair = task.key | {"words": task.setting.words}, task.pair
     fixed, moving = (image.to(key["device"]) for image in _images(pair, key["shrink"]))
     masks = (read_optional(path) for path in (pair.fixed_mask, pair.moving_mask))
     known = td.Annotations(**_present(zip(("fixed_mask", "moving_mask"), masks, strict=True), key["device"]))
@@ -169,8 +183,7 @@ def attempt(task: Task) -> list[Row]:
 def keys(options: argparse.Namespace) -> Iterator[Run]:
     """Yield what is asked for, pair by pair."""
     common = {"protocol": PROTOCOL, "shrink": options.shrink}
-    ours = {s.name: {"tool": "torchdeform", "settings": s.key, "code": _code()} for s in options.all_settings}
-    ours = {name: key | {"device": options.device} for name, key in ours.items()}
+    ours = {s.name: {"tool": "torchdeform", "device": options.device} | s.key for s in options.all_settings}
     theirs = {name: {"tool": name, "settings": TOOLS[name].settings} for name in options.peers}
     for which in options.sets:
         for pair in SETS[which](options.data)[: options.pairs]:
@@ -183,6 +196,8 @@ def missing(options: argparse.Namespace, book: Book) -> tuple[list[Task], list[t
     settings, tasks, others = {s.name: s for s in options.all_settings}, [], []
     for _, pair, name, key in keys(options):
         jitters = tuple(j for j in range(options.jitters) if not book.holds(key | {"jitter": j}))
+        if name in settings and settings[name].code:
+            continue  # only what is in the file already
         if jitters and name in settings:
             tasks.append(Task(pair, settings[name], jitters, key))
         elif name not in settings:
@@ -258,7 +273,13 @@ def main() -> None:
     if not options.print:
         run(options, book)
     table = Table(keys(options), book.rows, options.jitters)
-    print(shown(table), verdict(table, [s.name for s in options.settings]), *table.failed, sep="\n\n")
+    print(
+        f"code {_code()}, device {options.device}",
+        shown(table),
+        verdict(table, [s.name for s in options.settings]),
+        *table.failed,
+        sep="\n\n",
+    )
 
 
 if __name__ == "__main__":

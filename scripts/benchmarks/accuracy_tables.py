@@ -37,7 +37,8 @@ class Table:
         self.failed: list[str] = []
         self._rows: dict[tuple[str, str, str], list[Row]] = {}
         for which, pair, name, key in runs:
-            own = [row for row in rows if key.items() <= row.items() and row["jitter"] < jitters]
+            found = (row for row in rows if key.items() <= row.items() and row["jitter"] < jitters)
+            own = list({row["jitter"]: row for row in found}.values())
             self.pairs[which, pair.name] = pair
             self.failed += dict.fromkeys(f"{which}, {pair.name}, {name}: {r['failed']}" for r in own if "failed" in r)
             if len(own) == jitters and not any("failed" in row for row in own):

@@ -76,7 +76,7 @@ def prepare(pair: Pair, folder: Path, shrink: float = 1, shift: Sequence[float] 
     import torchdeform as td
     from torchdeform.io.images import read_labels, write_labels
 
-    files: dict[str, Path] = {}
+    files: dict[str, Any] = {}
     for side, image, by in zip(("fixed", "moving"), images(pair, shrink), ((), shift), strict=True):
         files[side] = folder / f"{side}.nii"
         td.write_image(_moved(image, by), files[side])

@@ -69,9 +69,26 @@ def test_runs_are_kept_chosen_from_and_not_done_again(options, tmp_path, monkeyp
     by_name = {line[1]: float(line[3]) for line in lines[:4]}
     assert list(by_name) == ["default", "none", "some", "fast"]
     assert by_name["none"] < by_name["some"]
-    means = [np.mean([row["dice"] for row in rows if row["settings"] == s.key]) for s in options.all_settings]
+    means = [np.mean([row["dice"] for row in rows if s.key.items() <= row.items()]) for s in options.all_settings]
     assert list(by_name.values()) == pytest.approx(means, abs=6e-5)
     assert "The default stays" in first or "The default would change to some" in first
+
+
+def test_what_older_code_did_is_compared_and_not_run(options, tmp_path, monkeypatch, capsys):
+    file = tmp_path / "runs.json"
+    monkeypatch.setattr(sys, "argv", [*sys.argv[: sys.argv.index("--beside")], "--beside", "--settings", "old=@abc"])
+    monkeypatch.setattr(accuracy, "_code", lambda: "abc")
+    accuracy.main()
+    rows = json.loads(file.read_text(encoding="utf-8"))
+    better = [row | {"dice": row["dice"] + 0.01, "settings": "of that time"} for row in rows]
+    file.write_text(json.dumps(better), encoding="utf-8")
+    monkeypatch.setattr(accuracy, "_code", lambda: "def")
+    capsys.readouterr()
+    accuracy.main()
+    told = capsys.readouterr().out
+    assert "| synthetic | old | 2 |" in told
+    assert "+0.0100 ± 0.0000" in told
+    assert len(json.loads(file.read_text(encoding="utf-8"))) == 2 * len(rows)
 
 
 def test_a_setting_that_fails_on_a_pair_is_named_and_not_chosen(options, monkeypatch, capsys):
