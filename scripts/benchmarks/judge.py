@@ -6,87 +6,93 @@ world.
 
 from pathlib import Path
 from statistics import mean, median
-from typing import Any
 
 import numpy as np
-import SimpleITK as sitk
+import torch
 from numpy.typing import NDArray
 from pairs import Pair
+
+import torchdeform as td
+from torchdeform.core.warp import sample
+from torchdeform.io.images import read_labels
+from torchdeform.io.points import matched
+from torchdeform.metrics.evaluation import common_labels
 
 Positions = NDArray[np.float64]
 
 
-def judge(pair: Pair, positions: Positions) -> dict[str, float]:
+def judge(pair: Pair, fixed: td.Image, positions: Positions) -> dict[str, float]:
     """Return overlap, landmark error and folds of a map, as far as the pair's files say what is right."""
-    fixed = sitk.ReadImage(str(pair.fixed))
-    figures = folds(fixed, positions)
+    return folds(fixed, positions) | quality(pair, fixed, positions)
+
+
+def quality(pair: Pair, fixed: td.Image, positions: Positions) -> dict[str, float]:
+    """Return overlap and landmark error of a map.
+
+    Args:
+        pair: the files.
+        fixed: the fixed image as it was registered, perhaps on a coarser grid than that of the labels.
+        positions: where its voxels go.
+    """
+    figures = {}
     if pair.fixed_labels and pair.moving_labels:
-        figures |= overlap(pair.fixed_labels, pair.moving_labels, positions)
+        labels = [read_labels(path) for path in (pair.fixed_labels, pair.moving_labels)]
+        here = to_array(fixed.to_world(fixed.grid.points(dtype=torch.float64)))
+        counted = pair.counted or common_labels(labels[0].data, labels[1].data)
+        figures |= overlap(nearest(labels[0], here), nearest(labels[1], positions), counted)
     if pair.fixed_points and pair.moving_points:
         figures |= landmarks((pair.fixed_points, pair.moving_points), fixed, positions)
     return figures
 
 
-def overlap(fixed_path: Path, moving_path: Path, positions: Positions) -> dict[str, float]:
-    """Return the mean Dice over the labels that both files have, those of moving warped to the nearest voxel."""
-    first = _first_channel(sitk.ReadImage(str(fixed_path)))
-    moving = sitk.ReadImage(str(moving_path))
-    warped = nearest(moving, positions)
-    common = (set(np.unique(first)) & set(np.unique(_first_channel(moving)))) - {0}
-    both = [(first == label, warped == label) for label in common]
-    return {"dice": mean(2 * float((a & b).sum()) / float(a.sum() + b.sum()) for a, b in both)}
+def to_array(world: torch.Tensor) -> Positions:
+    """Return points ``(1, D, *S)`` as positions ``(*S, D)``."""
+    return np.moveaxis(world[0].double().cpu().numpy(), 0, -1)
 
 
-def nearest(image: sitk.Image, positions: Positions) -> NDArray[Any]:
-    """Return the values of the voxels that the positions fall into, 0 outside of the image."""
-    values, dim = _first_channel(image), image.GetDimension()
-    direction = np.array(image.GetDirection()).reshape(dim, dim)
-    index = (positions - image.GetOrigin()) @ np.linalg.inv(direction).T / image.GetSpacing()
-    index = np.rint(index)[..., ::-1]
+def to_tensor(positions: Positions) -> torch.Tensor:
+    """Return positions ``(*S, D)`` as points ``(1, D, *S)``."""
+    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(positions, -1, 0)))[None]
+
+
+def overlap(fixed: NDArray[np.int64], warped: NDArray[np.int64], counted: tuple[int, ...]) -> dict[str, float]:
+    """Return the mean Dice of the labels ``counted`` that ``fixed`` has, and that of all labels except 0 as one.
+
+    Args:
+        fixed: labels.
+        warped: those of the moving image on the same voxels.
+        counted: labels that both images have.
+    """
+    most = int(max(fixed.max(), warped.max(), *counted)) + 1
+    sizes, others, both = (
+        np.bincount(values.ravel(), minlength=most) for values in (fixed, warped, fixed[fixed == warped])
+    )
+    each = [2 * float(both[k]) / float(sizes[k] + others[k]) for k in counted if sizes[k]]
+    union = 2 * float(((fixed > 0) & (warped > 0)).sum()) / float(sizes[1:].sum() + others[1:].sum())
+    return {"dice": mean(each), "union": union}
+
+
+def nearest(image: td.Image, positions: Positions) -> NDArray[np.int64]:
+    """Return the labels of the voxels that the positions fall into, 0 outside of the image."""
+    values = image.data[0, 0].numpy()
+    index = np.rint(to_array(image.to_grid(to_tensor(positions))) / image.grid.spacing)
     inside = ((index >= 0) & (index < values.shape)).all(-1)
-    safe = np.where(inside[..., None], index, 0).astype(int)
-    return np.where(inside, values[tuple(np.moveaxis(safe, -1, 0))], 0)
+    index = np.where(inside[..., None], index, 0).astype(int)
+    return np.where(inside, values[tuple(np.moveaxis(index, -1, 0))], 0).astype(np.int64)
 
 
-def _first_channel(image: sitk.Image) -> NDArray[Any]:
-    array = sitk.GetArrayFromImage(image)
-    return array[..., 0] if image.GetNumberOfComponentsPerPixel() > 1 else array
-
-
-def read_points(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Return points by name: elastix' text (world), or `number,X,Y` in pixels of size 1."""
-    lines = path.read_text(encoding="utf-8").split("\n")
-    if path.suffix == ".csv":
-        rows = [line.split(",") for line in lines[1:] if line.strip()]
-        return {row[0]: np.array(row[1:], dtype=float) for row in rows}
-    return {str(k): np.array(line.split(), dtype=float) for k, line in enumerate(lines[2:]) if line.strip()}
-
-
-def landmarks(files: tuple[Path, Path], fixed: sitk.Image, positions: Positions) -> dict[str, float]:
+def landmarks(files: tuple[Path, Path], fixed: td.Image, positions: Positions) -> dict[str, float]:
     """Return mean and median distance of the moved fixed points from their partners."""
-    first, second = map(read_points, files)
-    frame = sitk.GetImageFromArray(positions, isVector=True)
-    frame.CopyInformation(fixed)
-    errors = []
-    for name in (name for name in first if name in second):
-        index = np.clip(fixed.TransformPhysicalPointToContinuousIndex(first[name]), 0, np.array(fixed.GetSize()) - 1)
-        place = fixed.TransformContinuousIndexToPhysicalPoint(index.tolist())
-        errors.append(float(np.linalg.norm(frame.EvaluateAtPhysicalPoint(place) - second[name])))
+    first, second, _ = matched(*(td.read_points(path, fixed) for path in files))
+    moved = sample(to_tensor(positions), fixed.to_grid(first.T[None]), fixed.grid)
+    errors = (moved[0].T - second).norm(dim=1).tolist()
     return {"landmark_mean": mean(errors), "landmark_median": median(errors)}
 
 
-def folds(fixed: sitk.Image, positions: Positions) -> dict[str, float]:
+def folds(fixed: td.Image, positions: Positions) -> dict[str, float]:
     """Return folds by the certificate and by central differences, and the standard deviation of log J."""
-    import torch
-
-    import torchdeform as td
-
-    dim = fixed.GetDimension()
-    direction = np.array(fixed.GetDirection()).reshape(dim, dim)
-    own = ((positions - fixed.GetOrigin()) @ np.linalg.inv(direction).T)[..., ::-1]
-    grid = td.Grid(fixed.GetSize()[::-1], fixed.GetSpacing()[::-1])
-    phi = torch.from_numpy(np.moveaxis(own, -1, 0).copy())[None]
-    found = td.diagnose(phi - grid.points(dtype=phi.dtype), grid)
+    u = fixed.to_grid(to_tensor(positions)) - fixed.grid.points(dtype=torch.float64)
+    found = td.diagnose(u, fixed.grid)
     return {
         "folds": float(found.folds),
         "central_folds": float(found.central_folds),

@@ -34,7 +34,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from machine import describe_machine, peak_bytes
-from pairs import SETS, Pair
+from pairs import SETS, WHOLE_BRAINS, Pair
 from peer_tools import TOOLS, Job, limit_threads, load
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -43,9 +43,13 @@ _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "ITK_G
 
 Row = dict[str, Any]
 
+# What a `Pair` or a `Job` holds that is a text and no path.
+_PLAIN = ("name", "device")
+
 # What the table shows of a figure over the pairs.
 _COLUMNS = {
     "Dice": ("dice", lambda v: f"{median(v):.4f} ({mean(v):.4f})"),
+    "all labels as one": ("union", lambda v: f"{median(v):.4f} ({mean(v):.4f})"),
     "landmarks, mean": ("landmark_mean", lambda v: f"{median(v):.2f} ({mean(v):.2f})"),
     "landmarks, median": ("landmark_median", lambda v: f"{median(v):.2f} ({mean(v):.2f})"),
     "folds": ("folds", lambda v: f"{max(v):.0f}"),
@@ -58,28 +62,35 @@ _COLUMNS = {
 _EACH = (("dice", ".4f"), ("landmark_mean", ".2f"))
 
 
-def prepare(pair: Pair, folder: Path) -> Job:
-    """Write the images of a pair, and its masks, as every tool gets them."""
-    import SimpleITK as sitk
+def prepare(pair: Pair, folder: Path, shrink: float = 1, shift: Sequence[float] = ()) -> Job:
+    """Write the images of a pair, and its masks, as every tool gets them.
 
-    files = {}
-    for name in ("fixed", "moving", "fixed_mask", "moving_mask"):
-        if source := getattr(pair, name):
-            image = sitk.ReadImage(str(source))
-            image = sitk.Cast(image > 0, sitk.sitkUInt8) if "mask" in name else _grey(image)
-            files[name] = folder / f"{name}.nii"
-            sitk.WriteImage(image, str(files[name]))
+    Args:
+        pair: the files.
+        folder: where to.
+        shrink: see `reading.images`.
+        shift: how far the moving image is moved in the world, (x, y, z).
+    """
+    from reading import images
+
+    import torchdeform as td
+    from torchdeform.io.images import read_labels, write_labels
+
+    files: dict[str, Any] = {}
+    for side, image, by in zip(("fixed", "moving"), images(pair, shrink), ((), shift), strict=True):
+        files[side] = folder / f"{side}.nii"
+        td.write_image(_moved(image, by), files[side])
+        if source := getattr(pair, f"{side}_mask"):
+            mask = read_labels(source)
+            files[f"{side}_mask"] = folder / f"{side}_mask.nii"
+            counts = replace(mask, data=(mask.data != 0).float(), pixel_type="uint8")
+            write_labels(_moved(counts, by), files[f"{side}_mask"])
     return Job(files.pop("fixed"), files.pop("moving"), folder, **files)
 
 
-def _grey(image: Any) -> Any:
-    """Return an image with one channel of float32."""
-    import SimpleITK as sitk
-
-    if image.GetNumberOfComponentsPerPixel() > 1:
-        red, green, blue = (sitk.VectorIndexSelectionCast(image, k, sitk.sitkFloat32) for k in range(3))
-        image = 0.299 * red + 0.587 * green + 0.114 * blue
-    return sitk.Cast(image, sitk.sitkFloat32)
+def _moved(image: Any, by: Sequence[float]) -> Any:
+    """Return an image elsewhere in the world."""
+    return replace(image, origin=tuple(x + d for x, d in zip(image.origin, by, strict=True))) if by else image
 
 
 def run_here(order: Row) -> Row:
@@ -95,19 +106,22 @@ def run_here(order: Row) -> Row:
     figures = {"startup": startup, "seconds": time.perf_counter() - start, "GiB": peak_bytes() / 2**30}
     from judge import judge
 
-    return figures | judge(Pair(**_paths(order["pair"])), mapped())
+    import torchdeform as td
+
+    positions = mapped()
+    positions -= order.get("shift") or [0.0] * positions.shape[-1]
+    return figures | judge(Pair(**_paths(order["pair"])), td.read_image(job.fixed), positions)
 
 
 def _paths(files: Row) -> Row:
     """Return the arguments of a `Pair` or a `Job` with their paths as such again."""
-    plain = ("name", "device", "threads")
-    return {key: value if key in plain or value is None else Path(value) for key, value in files.items()}
+    return {key: Path(value) if isinstance(value, str) and key not in _PLAIN else value for key, value in files.items()}
 
 
-def run_apart(name: str, pair: Pair, job: Job, limit: float) -> Row:
-    """Run one tool on one pair in a process of its own."""
+def run_apart(name: str, pair: Pair, job: Job, limit: float, shift: Sequence[float] = ()) -> Row:
+    """Run one tool on one pair, whose moving image `prepare` has shifted, in a process of its own."""
     order, answer = job.folder / "order.json", job.folder / "answer.json"
-    content = {"tool": name, "pair": asdict(pair), "job": asdict(job), "started": time.time()}
+    content = {"tool": name, "pair": asdict(pair), "job": asdict(job), "started": time.time(), "shift": list(shift)}
     order.write_text(json.dumps(content, default=str), encoding="utf-8")
     command = [sys.executable, __file__, "--one", str(order), str(answer)]
     environment = os.environ | _environment(job)
@@ -177,45 +191,43 @@ class Book:
 def run_all(options: argparse.Namespace, book: Book) -> None:
     """Run what the book does not hold yet."""
     for which in options.sets:
-        for pair in SETS[which](options.data / which)[: options.pairs]:
+        for pair in SETS[which](options.data)[: options.pairs]:
             todo = {name: key for name, key in _keys(options, which, pair) if not book.holds(key)}
             if not todo:
                 continue
             with TemporaryDirectory() as folder:
                 job = replace(prepare(pair, Path(folder)), device=options.device, threads=options.threads)
                 for name, key in todo.items():
-                    book.add(key | _about(name) | run_in_folder(name, pair, job, options))
+                    book.add(key | about(name) | run_in_folder(name, pair, job, options.limit))
 
 
 def _keys(options: argparse.Namespace, which: str, pair: Pair) -> Iterator[tuple[str, Row]]:
-    masks = bool(pair.fixed_mask and pair.moving_mask and not options.no_masks)
     for name in options.tools:
-        how = {"masks": masks, "device": options.device, "threads": options.threads}
+        how = {"device": options.device, "threads": options.threads}
         yield name, {"set": which, "pair": pair.name, "tool": name} | how
 
 
-def _about(name: str) -> Row:
+def about(name: str) -> Row:
+    """Return what ran, where and when."""
     tool = TOOLS[name]
-    about = {"package": tool.package, "version": version(tool.package), "settings": tool.settings}
-    return about | {"date": str(date.today()), "machine": describe_machine()}
+    what = {"package": tool.package, "version": version(tool.package), "settings": tool.settings}
+    return what | {"date": str(date.today()), "machine": describe_machine()}
 
 
-def run_in_folder(name: str, pair: Pair, job: Job, options: argparse.Namespace) -> Row:
+def run_in_folder(name: str, pair: Pair, job: Job, limit: float, shift: Sequence[float] = ()) -> Row:
     """Run a tool in a folder of its own."""
-    masks = {"fixed_mask": None, "moving_mask": None} if options.no_masks else {}
     with TemporaryDirectory() as folder:
-        return run_apart(name, pair, replace(job, folder=Path(folder), **masks), options.limit)
+        return run_apart(name, pair, replace(job, folder=Path(folder)), limit, shift)
 
 
 def table(rows: Sequence[Row]) -> str:
     """Return one line for each set and tool, as Markdown."""
     lines = ["| set | tool | pairs | " + " | ".join(_COLUMNS) + " | each pair |", "|---" * (len(_COLUMNS) + 4) + "|"]
-    for which, tool, masks in dict.fromkeys((row["set"], row["tool"], row["masks"]) for row in rows):
-        own = [row for row in rows if (row["set"], row["tool"], row["masks"]) == (which, tool, masks)]
+    for which, tool in dict.fromkeys((row["set"], row["tool"]) for row in rows):
+        own = [row for row in rows if (row["set"], row["tool"]) == (which, tool)]
         good = [row for row in own if "failed" not in row]
         cells = [_cell(good, key, show) for key, show in _COLUMNS.values()]
-        name = f"{which}, masks" if masks else which
-        lines.append(f"| {name} | {tool} | {len(good)} | " + " | ".join([*cells, _each(own)]) + " |")
+        lines.append(f"| {which} | {tool} | {len(good)} | " + " | ".join([*cells, _each(own)]) + " |")
     return "\n".join(lines)
 
 
@@ -252,14 +264,14 @@ def parse() -> argparse.Namespace:
     """Return the options."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", nargs="?", default=os.environ.get("TORCHDEFORM_DATA", "../shared/data"), type=Path)
-    parser.add_argument("--sets", nargs="+", default=list(SETS), choices=list(SETS))
+    small = [name for name in SETS if name not in WHOLE_BRAINS]
+    parser.add_argument("--sets", nargs="+", default=small, choices=list(SETS))
     parser.add_argument("--tools", nargs="+", default=list(TOOLS), choices=list(TOOLS))
     parser.add_argument("--pairs", type=int, help="at most so many of each set")
     parser.add_argument("--json", type=Path, help="file of all runs; runs that it has are not done again")
     parser.add_argument("--again", nargs="+", default=[], choices=list(TOOLS), help="run these again all the same")
     parser.add_argument("--retry", action="store_true", help="run again what failed")
     parser.add_argument("--print", action="store_true", help="only print the table of the runs in the file")
-    parser.add_argument("--no-masks", action="store_true", help="keep masks to ourselves")
     parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="for the tools that can choose")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--limit", type=float, default=3600, help="seconds a run may take")

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from pairs import SETS, Pair
+from pairs import SETS, WHOLE_BRAINS, Pair
 from skimage import data as pictures
 from torch import Tensor
 
@@ -171,7 +171,7 @@ class Cases:
     """All cases on the images of a folder."""
 
     def __init__(self, folder: Path) -> None:
-        self.sets = {name: make(folder / name) for name, make in SETS.items()}
+        self.sets = {name: SETS[name](folder) for name in SETS if name not in (*WHOLE_BRAINS, "lung_ct_3d_bare")}
         self.folder = folder
 
     def _pair(self, name: str, index: int = 0) -> Pair:

@@ -58,19 +58,19 @@ def point_error(pair: Pair, affine: Affine) -> float:
     ],
 )
 def test_labels_overlap(data_folder, name, least):
-    scores = [dice(pair, aligned(pair)[1].affine) for pair in SETS[name](data_folder / name)]
+    scores = [dice(pair, aligned(pair)[1].affine) for pair in SETS[name](data_folder)]
     assert sum(scores) / len(scores) >= least
 
 
 @pytest.mark.parametrize(("masks", "most"), [(False, 6.4), (True, 3.4)])
 def test_lung_from_another_table_position(data_folder, masks, most):
-    (pair,) = SETS["lung_ct_3d"](data_folder / "lung_ct_3d")
+    (pair,) = SETS["lung_ct_3d"](data_folder)
     assert point_error(pair, aligned(pair, masks=masks)[1].affine) <= most  # 35.3 mm before; the best fit leaves 2.5
 
 
 def test_stains_of_turned_and_torn_sections(data_folder):
     before, after = [], []
-    for pair in SETS["histology_2d"](data_folder / "histology_2d"):
+    for pair in SETS["histology_2d"](data_folder):
         before.append(point_error(pair, Affine.identity(2)))
         after.append(point_error(pair, aligned(pair)[1].affine))
     assert all(a < 0.65 * b for a, b in zip(after, before, strict=True))

@@ -2,16 +2,20 @@
 
 import json
 from argparse import Namespace
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import product
 
 import numpy as np
 import peers
 import pytest
 import SimpleITK as sitk
-from judge import folds, landmarks, nearest, overlap
+import torch
+from judge import folds, landmarks, nearest, quality, to_array
 from pairs import Pair
 from peer_tools import TOOLS, Job, by_displacement
+
+import torchdeform as td
+from torchdeform.io.images import read_labels
 
 SHAPES = [(23, 31), (11, 14, 17)]
 
@@ -68,8 +72,14 @@ def test_labels_are_carried_and_compared_as_simpleitk_does(shape, tmp_path):
     measures.Execute(fixed, carried)
     expected = [measures.GetDiceCoefficient(label) for label in range(1, 5)]
     positions = moved(fixed, transform)
-    np.testing.assert_array_equal(nearest(moving, positions), sitk.GetArrayFromImage(carried))
-    assert overlap(files[0], files[1], positions)["dice"] == pytest.approx(np.mean(expected))
+    np.testing.assert_array_equal(nearest(read_labels(files[1]), positions), sitk.GetArrayFromImage(carried))
+    pair = Pair("one", *files, *files)
+    found = quality(pair, td.read_image(files[0]), positions)
+    assert found["dice"] == pytest.approx(np.mean(expected))
+    measures.Execute(fixed > 0, carried > 0)
+    assert found["union"] == pytest.approx(measures.GetDiceCoefficient(1))
+    some = quality(replace(pair, counted=(2, 3)), td.read_image(files[0]), positions)
+    assert some == pytest.approx({"dice": np.mean(expected[1:3]), "union": found["union"]})
     assert 0.05 < np.mean(expected) < 0.95
 
 
@@ -86,7 +96,8 @@ def test_landmarks_go_where_the_map_takes_them(shape, tmp_path):
     for rows, file in zip((points, partners), files, strict=True):
         file.write_text("\n".join(["point", "9", *(" ".join(map(repr, map(float, row))) for row in rows)]) + "\n")
     errors = [np.linalg.norm(np.array(transform.TransformPoint(p)) - q) for p, q in zip(points, partners, strict=True)]
-    found = landmarks((files[0], files[1]), fixed, moved(fixed, transform))
+    sitk.WriteImage(fixed, str(tmp_path / "fixed.mha"))
+    found = landmarks((files[0], files[1]), td.read_image(tmp_path / "fixed.mha"), moved(fixed, transform))
     assert found["landmark_mean"] == pytest.approx(np.mean(errors))
     assert found["landmark_median"] == pytest.approx(np.median(errors))
 
@@ -121,14 +132,15 @@ def central(u: np.ndarray, order: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_folds_are_those_of_a_computation_by_hand(shape):
+def test_folds_are_those_of_a_computation_by_hand(shape, tmp_path):
     dim = len(shape)
     fixed = placed(np.zeros(shape, np.float32), 4)
     u = 0.6 * np.random.default_rng(6).normal(size=(dim, *shape))
     steps = (u[::-1] * np.array(fixed.GetSpacing()).reshape(-1, *[1] * dim)).reshape(dim, -1)
     turned = np.array(fixed.GetDirection()).reshape(dim, dim) @ steps
     still = moved(fixed, sitk.Transform(dim, sitk.sitkIdentity))
-    found = folds(fixed, still + turned.T.reshape(*shape, dim))
+    sitk.WriteImage(fixed, str(tmp_path / "fixed.mha"))
+    found = folds(td.read_image(tmp_path / "fixed.mha"), still + turned.T.reshape(*shape, dim))
     inner = (slice(None), *[slice(1, -1)] * dim)
     wide = np.pad(u, [(0, 0), *[(1, 1)] * dim], mode="edge")
     assert found["folds"] == (smallest_simplices(u) <= 0).sum() > 0
@@ -161,7 +173,7 @@ def pair(tmp_path) -> Pair:
 def options(tmp_path, monkeypatch, pair) -> Namespace:
     monkeypatch.setitem(peers.SETS, "synthetic", lambda _: [pair])
     how = {"data": tmp_path, "sets": ["synthetic"], "pairs": None, "device": "cpu", "threads": 1, "limit": 120.0}
-    return Namespace(tools=["unregistered", "torchdeform_fast", "missing"], no_masks=False, **how)
+    return Namespace(tools=["unregistered", "torchdeform_fast", "missing"], **how)
 
 
 def test_a_run_is_a_row_a_failure_too_and_nothing_runs_twice(options, tmp_path, monkeypatch):
@@ -181,6 +193,24 @@ def test_a_run_is_a_row_a_failure_too_and_nothing_runs_twice(options, tmp_path, 
     assert len(lines) == 2 + 3
     assert "KeyError" in lines[-1]
     assert all(name in peers.circumstances(book.rows) for name in options.tools)
+
+
+def test_a_shift_of_the_moving_file_is_taken_off_again(pair, tmp_path, monkeypatch):
+    """Nothing moves: where voxels go in the file that is shifted, less the shift, is where they are."""
+    monkeypatch.setattr(peers, "limit_threads", lambda _: None)
+    job = peers.prepare(pair, tmp_path, shift=(0.3, -0.2))
+    here, there = td.read_image(pair.moving), td.read_image(job.moving)
+    assert there.origin == pytest.approx([x + d for x, d in zip(here.origin, (0.3, -0.2), strict=True)])
+    monkeypatch.setitem(peers.TOOLS, "follows", replace(TOOLS["unregistered"], register=_follow))
+    order = {"tool": "follows", "pair": asdict(pair), "job": asdict(job), "started": 0.0, "shift": [0.3, -0.2]}
+    still = quality(pair, here, to_array(here.to_world(here.grid.points(dtype=torch.float64))))
+    found = peers.run_here(json.loads(json.dumps(order, default=str)))
+    assert {key: found[key] for key in still} == still
+
+
+def _follow(job: Job):
+    by = np.array(td.read_image(job.moving).origin) - td.read_image(job.fixed).origin
+    return lambda: by_displacement(job) + by
 
 
 def test_what_is_not_installed_is_said(tmp_path, monkeypatch):
