@@ -18,7 +18,7 @@ from torchdeform.core.transform import Affine
 from torchdeform.core.warp import sample, warp
 from torchdeform.errors import InputError
 from torchdeform.registration.deformable import register
-from torchdeform.registration.optimise import forward_similarity
+from torchdeform.registration.optimise import compared, forward_similarity
 from torchdeform.registration.problem import Annotations, RegistrationProblem, moved, placed_images, resample_pair
 from torchdeform.registration.tissue import Tissue
 
@@ -275,7 +275,9 @@ def test_where_the_moving_image_does_not_reach_nothing_is_compared(similarity):
     beyond = warp(problem.moving_mask, u, grid) == 0
     other = replace(problem, fixed=torch.where(beyond, blobs(grid.shape, 2) / 6, fixed))
     settings = settings_of(measure=similarity)
-    known, found = (forward_similarity(each, settings).evaluate(u)[1:] for each in (problem, other))
+    known, found = (
+        forward_similarity(each, compared(each, settings)[0], settings).evaluate(u)[1:] for each in (problem, other)
+    )
     assert 0.2 < beyond.float().mean() < 0.5
     torch.testing.assert_close(found, known)
     assert known[1][beyond].abs().max() == 0

@@ -7,10 +7,12 @@ from typing import Annotated
 import typer
 
 from torchdeform.cli.options import (
+    FixedFeatures,
     FixedLabels,
     FixedMask,
     FixedPoints,
     Json,
+    MovingFeatures,
     MovingLabels,
     MovingMask,
     MovingPoints,
@@ -25,7 +27,7 @@ from torchdeform.io.files import atomic_file, require_target, suffix
 from torchdeform.io.images import read_labels, read_optional
 from torchdeform.io.point_tables import FIXED, MOVING
 from torchdeform.io.points import read_points
-from torchdeform.pipeline.annotations import check_annotations
+from torchdeform.pipeline.annotations import check_annotations, check_features
 from torchdeform.pipeline.config import load_settings
 from torchdeform.pipeline.preflight import ERROR, Finding, Report, preflight
 from torchdeform.pipeline.tissue import check_tissue
@@ -53,6 +55,8 @@ def check(
     moving_points: MovingPoints = None,
     fixed_labels: FixedLabels = None,
     moving_labels: MovingLabels = None,
+    fixed_features: FixedFeatures = None,
+    moving_features: MovingFeatures = None,
     tissue: Tissue = None,
     align: Align = "affine",
     out: Picture = None,
@@ -75,6 +79,7 @@ def check(
         *_check_annotations(images[0], FIXED, fixed_points, fixed_labels),
         *_check_annotations(images[1], MOVING, moving_points, moving_labels),
         *([] if tissue is None else check_tissue(images[0], read_labels(tissue))),
+        *check_features(images, (read_optional(fixed_features), read_optional(moving_features))),
     )
     report = Report.made_of(*found.findings, *more)
     predicted = None if report.of(ERROR) else _predicted(*images, *masks, align)

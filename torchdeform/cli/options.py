@@ -43,6 +43,8 @@ FixedPoints = Annotated[Path | None, optional_file("Landmarks (csv, elastix txt,
 MovingPoints = Annotated[Path | None, optional_file("... and the same landmarks in MOVING.")]
 FixedLabels = Annotated[Path | None, optional_file("Regions, whose overlap is measured ...")]
 MovingLabels = Annotated[Path | None, optional_file("... and the same regions of MOVING.")]
+FixedFeatures = Annotated[Path | None, optional_file("Channels to compare in place of intensities ...")]
+MovingFeatures = Annotated[Path | None, optional_file("... and the same channels of MOVING.")]
 Tissue = Annotated[Path | None, optional_file("Tissue of FIXED: say what 1 is by --set tissues.1=rigid.", "LABELS")]
 Device = Annotated[str, choice(DEVICES, "auto, cpu or cuda.")]
 Quiet = Annotated[bool, flag("--quiet", "Print errors only.")]

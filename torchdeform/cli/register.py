@@ -10,10 +10,12 @@ import typer
 
 from torchdeform.cli.options import (
     Device,
+    FixedFeatures,
     FixedLabels,
     FixedMask,
     FixedPoints,
     Json,
+    MovingFeatures,
     MovingLabels,
     MovingMask,
     MovingPoints,
@@ -55,6 +57,13 @@ Align = Annotated[str | None, choice(ALIGNMENTS, "First: {} (usual).", "KIND", s
 PointsWeight = Annotated[
     float | None, typer.Option(metavar="W", show_default="0", help="Weight of the landmarks against the similarity.")
 ]
+LabelsWeight = Annotated[
+    float | None, typer.Option(metavar="W", show_default="0", help="Weight of the labels against the similarity.")
+]
+Features = Annotated[
+    str | None,
+    typer.Option(metavar="mind|FILE", show_default=False, help="Compare what a TorchScript program makes (it is run)."),
+]
 Symmetric = Annotated[bool, flag("--symmetric", "Treat both images alike: swapping them inverts the map.")]
 Memory = Annotated[
     str | None, typer.Option(metavar="SIZE", show_default="what is free", help="Use at most this, such as 4GB.")
@@ -81,6 +90,10 @@ def register(
     points_weight: PointsWeight = None,
     fixed_labels: FixedLabels = None,
     moving_labels: MovingLabels = None,
+    labels_weight: LabelsWeight = None,
+    features: Features = None,
+    fixed_features: FixedFeatures = None,
+    moving_features: MovingFeatures = None,
     tissue: Tissue = None,
     symmetric: Symmetric = False,
     preset: Preset = "default",
@@ -101,7 +114,13 @@ def register(
     displacement.nii.gz, overview.png and result.json, all or none.
     """
     # Options that were not given must not override the preset and the file.
-    shortcuts = {"align": align, "points_weight": points_weight, "symmetric": symmetric or None}
+    shortcuts = {
+        "align": align,
+        "points_weight": points_weight,
+        "labels_weight": labels_weight,
+        "features": features,
+        "symmetric": symmetric or None,
+    }
     overrides = {key: value for key, value in shortcuts.items() if value is not None}
     settings = load_settings(preset, config, dict(map(parse_override, assignments or [])) | overrides)
     files = PairFiles(
@@ -114,6 +133,8 @@ def register(
         moving_points=moving_points,
         fixed_labels=fixed_labels,
         moving_labels=moving_labels,
+        fixed_features=fixed_features,
+        moving_features=moving_features,
         tissue=tissue,
     )
     limit = None if memory is None else parse_size(memory)
@@ -173,8 +194,8 @@ def _can_print(text: str) -> bool:
 
 def _measured(record: dict[str, Any]) -> dict[str, str]:
     """Return lines about labels and landmarks, if they were given."""
-    lines = {}
-    for key, name, unit in (("dice_mean", "Dice", ""), ("landmark_error_mean", "landmark error", f" {record['unit']}")):
+    lines, dice = {}, "Dice (labels in the cost)" if record["labels_in_cost"] else "Dice"
+    for key, name, unit in (("dice_mean", dice, ""), ("landmark_error_mean", "landmark error", f" {record['unit']}")):
         figures = [f"{stage[key]:.4g}" for stage in record["evaluation"].values() if key in stage]
         if figures:
             lines[name] = " -> ".join(figures) + unit

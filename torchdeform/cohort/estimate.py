@@ -12,14 +12,17 @@ from torchdeform.core.worker import TimeLimit, Worker, WorkerLost
 from torchdeform.errors import InputError, explain
 from torchdeform.io.gate import DAMAGED
 from torchdeform.io.images import image_size
-from torchdeform.pipeline.memory import choices, fitting_grid, footprint
+from torchdeform.metrics.mind import neighbour_pairs
+from torchdeform.pipeline.memory import Channels, choices, fitting_grid, footprint
 from torchdeform.registration.optimise import steps_on
+from torchdeform.registration.settings import MIND
 
 # Seconds of one core of an x86 server: of a pair, whatever its size; and per node, step and channel with
 # LNCC, by dimension; `Measure.time` has the others beside it.
 _PAIR = 1.5
 _PER_NODE_STEP = {2: 2e-7, 3: 3e-7}
 _HEADER = 60.0  # seconds that reading a header may take
+_FEATURES = 16  # that a program is taken to make, which is not run for an estimate
 
 # Shape and channels of an image; None where its file does not say; a sentence where that cannot be read.
 Size = tuple[tuple[int, ...], int] | str | None
@@ -66,8 +69,8 @@ def estimate(jobs: Sequence[Job]) -> Costs:
 def _seconds(job: Job, size: Size) -> float | None:
     if not isinstance(size, tuple):
         return None
-    (shape, channels), settings = size, job.settings
-    grid, (measures, _, symmetric) = Grid(shape), choices(settings)
+    settings, (grid, channels) = job.settings, _channels(job, size)
+    measures, _, symmetric = choices(settings)
     if job.memory is not None:
         try:
             grid = fitting_grid(grid, job.memory, channels, settings)
@@ -78,7 +81,8 @@ def _seconds(job: Job, size: Size) -> float | None:
     steps = steps[len(steps) - len(levels) :]
     node_steps = sum(math.prod(g.shape) * steps_on(g, n, settings) for g, n in zip(levels, steps, strict=True))
     maps = (2 if symmetric else 1) + len(set(settings.sliding))
-    fields = maps * channels * sum(measure.time for measure in measures.values())
+    compared = channels.features if settings.only_features else channels.features + channels.images
+    fields = maps * compared * sum(measure.time for measure in measures.values())
     return _PAIR + fields * _PER_NODE_STEP[grid.dim] * node_steps
 
 
@@ -121,9 +125,16 @@ def size_of(path: Path) -> Size:
         return explain(error)[0]
 
 
+def _channels(job: Job, size: tuple[tuple[int, ...], int]) -> tuple[Grid, Channels]:
+    """Return the grid of a pair, and its channels, as far as they are known beforehand."""
+    (shape, images), settings = size, job.settings
+    made = images * len(neighbour_pairs(len(shape))) if MIND in settings.sources else 0
+    others = len(settings.programs) + (job.files.fixed_features is not None)
+    return Grid(shape), Channels(images, made + others * _FEATURES)
+
+
 def _need(job: Job, size: Size) -> int:
     if not isinstance(size, tuple):
         return job.memory or 0
-    shape, channels = size
-    need = footprint(Grid(shape), channels, job.settings)
+    need = footprint(*_channels(job, size), job.settings)
     return need if job.memory is None else min(need, job.memory)

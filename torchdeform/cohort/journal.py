@@ -140,6 +140,7 @@ class Journal:
             "voxels": job.voxels,
             "submission": [path.name for path in (job.submission, *job.also) if path is not None],
             "inputs": inputs,
+            "programs": [self._digest(Path(path)) for path in job.settings.programs],
         }
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 

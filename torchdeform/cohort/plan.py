@@ -19,7 +19,9 @@ from torchdeform.io.files import atomic_file, atomic_folder
 from torchdeform.io.gate import read_text, require_file, require_name
 from torchdeform.io.transforms import write_voxel_displacement
 from torchdeform.pipeline.register import Outcome, PairFiles, register_files
-from torchdeform.pipeline.tissue import contradiction
+from torchdeform.pipeline.tissue import contradiction as unexplained_tissue
+from torchdeform.registration.channels import contradiction
+from torchdeform.registration.problem import PAIRED
 from torchdeform.registration.result import Callback
 from torchdeform.registration.settings import RegistrationSettings
 
@@ -129,7 +131,7 @@ def plan(cohort: Cohort) -> Plan:
     problems: list[Failure] = []
     for pair in found:
         settings = resolve(pair)
-        sentence = pair.problem or _missing(pair) or _leading_out(pair, cohort.out) or _misnamed_tissue(pair, settings)
+        sentence = pair.problem or _missing(pair) or _leading_out(pair, cohort.out) or _contradiction(pair, settings)
         if sentence:
             problems.append(Failure(pair.name, sentence))
         else:
@@ -191,7 +193,7 @@ def _missing(pair: PairSpec) -> str:
             require_file(path, _WHAT.get(key.rpartition("_")[2], "image file"), folder=True)
         except InputError as error:
             return f"{key} {error}; see {pair.where}"
-    for what in ("points", "labels"):
+    for what in PAIRED:
         given = [side for side in ("fixed", "moving") if f"{side}_{what}" in pair.files]
         if len(given) == 1:
             other = {"fixed": "moving", "moving": "fixed"}[given[0]]
@@ -199,12 +201,25 @@ def _missing(pair: PairSpec) -> str:
     return ""
 
 
+def _contradiction(pair: PairSpec, settings: RegistrationSettings) -> str:
+    """Return a sentence if the settings of a pair do not go with its files."""
+    features, labels = (f"fixed_{what}" in pair.files for what in ("features", "labels"))
+    for path in settings.programs:
+        try:
+            require_file(Path(path), "program of features")
+        except InputError as error:
+            return f"features: {error}; see {pair.where}"
+    if problem := contradiction(settings, features=features, labels=labels):
+        return f"{problem}; see {pair.where}"
+    return _misnamed_tissue(pair, settings)
+
+
 def _misnamed_tissue(pair: PairSpec, settings: RegistrationSettings) -> str:
     """Return a sentence if a pair has labels of tissue and its settings say nothing of them, or the other way round."""
     given = TISSUE in pair.files
     if given and not settings.knows_tissue:
         return f"the settings do not say what the labels of tissue are, as tissues: {{1: rigid}} does; see {pair.where}"
-    problem = contradiction(given, settings, "tissue")
+    problem = unexplained_tissue(given, settings, "tissue")
     return f"{problem}; see {pair.where}" if problem else ""
 
 

@@ -20,21 +20,31 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from torchdeform.cohort.patterns import compiled, part_names, require_parts
-from torchdeform.cohort.settings import EngineSettings, Pattern, Place, Size, Strict, TemplateSettings
+from torchdeform.cohort.settings import (
+    EngineSettings,
+    Pattern,
+    Place,
+    Size,
+    Strict,
+    TemplateSettings,
+    absolute_path,
+    expand,
+)
 from torchdeform.errors import InputError, nearest_name, require_choice, shown
 from torchdeform.io.texts import Lines, to_yaml
 from torchdeform.pipeline.config import load_settings, merged_settings, preset_names, read_yaml, read_yaml_lines
+from torchdeform.registration.problem import PAIRED
 from torchdeform.registration.settings import SHORT_FORMS, RegistrationSettings
 
 # Companions of an image by their keys here, with their names in a pair.
-COMPANIONS = {"labels": "labels", "masks": "mask", "points": "points"}
+COMPANIONS = {"labels": "labels", "masks": "mask", "points": "points", "features": "features"}
 
 # What is known of the fixed image of a pair alone, by its key here and in a pair.
 TISSUE = "tissue"
 
 # Keys that belong to one pairing only.
 _BELONGS = {
-    **dict.fromkeys(("fixed", "fixed_labels", "fixed_mask", "fixed_points"), "template"),
+    **dict.fromkeys(("fixed", *(f"fixed_{name}" for name in COMPANIONS.values())), "template"),
     "reference": "group",
     "both_ways": "all",
 }
@@ -117,6 +127,10 @@ class Pair(Strict):
     """Regions of the fixed image."""
     moving_labels: Place | None = None
     """The same regions of the moving image."""
+    fixed_features: Place | None = None
+    """Channels of the fixed image that are compared."""
+    moving_features: Place | None = None
+    """The same channels of the moving image."""
     tissue: Place | None = None
     """Labels of tissue in the fixed image, for the settings tissues and sliding."""
     settings: Overrides = Field(default_factory=dict)
@@ -147,6 +161,8 @@ class Images(Strict):
     """Pattern of an image's mask."""
     points: Pattern | None = None
     """Pattern of an image's landmarks."""
+    features: Pattern | None = None
+    """Pattern of an image's channels that are compared; a template uses none."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -189,6 +205,8 @@ class PatternPairs(Images):
     """template: its mask."""
     fixed_points: Pattern | None = None
     """template: its landmarks."""
+    fixed_features: Pattern | None = None
+    """template: its channels that are compared."""
     tissue: Pattern | None = None
     """Labels of tissue in the fixed image of each pair, for the settings tissues and sliding. {part} is the part of the
     fixed image; template: of the moving image."""
@@ -211,14 +229,14 @@ class PatternPairs(Images):
         for key in {"template": ("fixed",), "group": ("reference",)}.get(self.pairing, ()):
             if not getattr(self, key):
                 raise InputError(f"pairing: {self.pairing} needs {key}")
-        for one, other in (("labels", "fixed_labels"), ("points", "fixed_points")):
+        for one, other in ((name, f"fixed_{name}") for name in PAIRED):
             if self.pairing == "template" and (getattr(self, one) is None) != (getattr(self, other) is None):
                 raise InputError(f"{one} and {other} are compared with each other; give both or neither")
         return self
 
     def fixed_files(self) -> dict[str, str]:
         """Return the patterns of a fixed image's own files, by their keys here: of a template's, and of its tissue."""
-        keys = ("fixed", "fixed_labels", "fixed_mask", "fixed_points", TISSUE)
+        keys = ("fixed", *(f"fixed_{name}" for name in COMPANIONS.values()), TISSUE)
         return {key: value for key in keys if (value := getattr(self, key)) is not None}
 
 
@@ -287,7 +305,8 @@ class Cohort(Strict):
 
     def resolve(self, overrides: Mapping[str, object] | None = None) -> RegistrationSettings:
         """Return the settings of a pair: the preset, changed by the cohort's settings, changed by ``overrides``."""
-        return load_settings(self.preset, overrides=merged_settings(self.settings, overrides or {}))
+        settings = load_settings(self.preset, overrides=merged_settings(self.settings, overrides or {}))
+        return settings.with_programs(lambda name: absolute_path(self.path.parent.resolve(), expand(name)))
 
     def to_yaml(self) -> str:
         """Return the cohort as a complete file: absolute paths, variables filled in, all settings."""

@@ -71,6 +71,11 @@ class Measure:
     common_scale: bool = False
     references: tuple[str, ...] = ()
 
+    @property
+    def compares_features(self) -> bool:
+        """Whether it makes features of the images, and compares these."""
+        return self.features is not INTENSITIES
+
     def choose(self, **available: object) -> dict[str, Any]:
         """Return those of the options ``window`` and ``grid`` that this measure takes."""
         return {name: available[name] for name in self.options}
@@ -158,11 +163,17 @@ def similarity_weights(similarity: str | Mapping[str, float]) -> dict[str, float
     if not isinstance(similarity, str | Mapping) or not similarity:
         raise InputError(f"similarity must be auto, name one of {', '.join(MEASURES)}, or several with their weights")
     weights = {_USUAL if similarity == AUTO else similarity: 1.0} if isinstance(similarity, str) else dict(similarity)
-    for name, weight in weights.items():
+    for name in weights:
         require_choice(name, (*MEASURES, *([AUTO] if isinstance(similarity, str) else [])), "similarity")
-        if isinstance(weight, bool) or not isinstance(weight, Real) or not 0 < weight < math.inf:
-            raise InputError(f"similarity: the weight of {name} must be a positive finite number, got {weight!r}")
-    return weights
+    return weights_of(weights, "similarity")
+
+
+def weights_of(weights: Mapping[Any, Any], where: str) -> dict[Any, float]:
+    """Return weights by what they are of; `InputError`, which names ``where``, unless all are positive and finite."""
+    for name, weight in weights.items():
+        if isinstance(weight, bool) or not isinstance(weight, Real) or not 0 < float(weight) < math.inf:
+            raise InputError(f"{where}: the weight of {name} must be a positive finite number, got {weight!r}")
+    return dict(weights)
 
 
 def measure_name(similarity: str | Mapping[str, float]) -> str:

@@ -10,7 +10,7 @@ from torch.utils.checkpoint import checkpoint
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import warp
 from torchdeform.errors import require_choice, require_ranges
-from torchdeform.metrics.similarity import INTENSITIES, MEASURES
+from torchdeform.metrics.similarity import MEASURES
 from torchdeform.nn.precision import full_precision
 from torchdeform.registration.optimise import Level, Objective, optimise_level
 from torchdeform.registration.settings import RegistrationSettings
@@ -42,7 +42,7 @@ class DeformableRegistration(nn.Module):
         super().__init__()
         settings = settings or RegistrationSettings()
         # Others compare features, which are warped in place of the image.
-        measures = [name for name, measure in MEASURES.items() if measure.features is INTENSITIES]
+        measures = [name for name, measure in MEASURES.items() if not measure.compares_features]
         settings = settings.decided()
         require_choice(settings.similarity.measure, measures, "DeformableRegistration: similarity")
         self.grid, self.steps, self.settings = grid, steps, settings

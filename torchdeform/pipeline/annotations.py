@@ -1,4 +1,4 @@
-"""Whether landmarks and labels belong to the image that they are given for."""
+"""Whether landmarks, labels and features belong to the image that they are given for."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +9,7 @@ from torch import Tensor
 from torchdeform.core.image import Image, overlap, require_same_place
 from torchdeform.errors import InputError
 from torchdeform.pipeline.preflight import ERROR, WARNING, Finding
+from torchdeform.registration.problem import Annotations
 
 _MARGIN = 3.0  # voxels by which a landmark may lie outside without a word
 _PIXELS = "px"
@@ -77,10 +78,25 @@ def check_labels(image: Image, labels: Image) -> Iterator[Finding]:
         yield Finding(WARNING, f"{text}; check the origin and spacing in its header")
 
 
+def check_features(images: tuple[Image, Image], features: tuple[Image | None, Image | None]) -> Iterator[Finding]:
+    """Yield what looks wrong with channels to compare: those of one image only, unlike ones, those in another place."""
+    first, second = features
+    if first is None and second is None:
+        return
+    try:
+        Annotations(fixed_features=first, moving_features=second).require_images(images[0].grid.dim)
+    except InputError as error:
+        yield Finding(ERROR, str(error))
+        return
+    for image, channels in zip(images, features, strict=True):
+        if channels is not None:
+            yield from check_labels(image, channels)
+
+
 def _of_another_size(image: Image, labels: Image, apart: str) -> str:
     if labels.grid.shape == image.grid.shape:
         return f"{apart}, or save both with the same spacing"
     return (
-        f"{labels.name} is {labels.grid.size_text} but {image.name} is {image.grid.size_text}; give labels with a "
+        f"{labels.name} is {labels.grid.size_text} but {image.name} is {image.grid.size_text}; give one with a "
         "value for every pixel, turned as the image is"
     )

@@ -136,6 +136,8 @@ def _given_value(keys: Sequence[str], value: object) -> object:
         return {label: _frozen(kind) for label, kind in value.items()}
     if keys[0] == _TISSUES:
         return _frozen(value) if len(keys) == 2 else value
+    if keys == ["features"]:  # names of files have dots, and a mapping takes the place of another
+        return _frozen(value)
     if keys == ["sliding"] and isinstance(value, int | str) and not isinstance(value, bool):
         return [value]
     return _whole_group(keys[0], value) if len(keys) == 1 else value

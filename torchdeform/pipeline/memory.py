@@ -1,6 +1,7 @@
 """Memory of a registration: how much it takes, and which grid fits."""
 
 import math
+from dataclasses import dataclass
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.memory import at_least, readable
@@ -10,6 +11,7 @@ from torchdeform.fem.solver import LARGEST_MATRIX
 from torchdeform.fem.system import DivCurlSystem
 from torchdeform.fem.weights import Weights
 from torchdeform.metrics.similarity import Measure, measures_in
+from torchdeform.registration.channels import MOST_PROBABILITIES
 from torchdeform.registration.settings import RegistrationSettings
 
 _SHRINK = 0.97  # steps in which the grid that fits is sought, per axis
@@ -24,8 +26,20 @@ _DISCRETE = {2: (130.0, 75.0), 3: (100.0, 65.0)}
 _PER_ENTRY = 90
 # And of the map of each label that glides: as a share of the first map.
 _PER_SIDE = 0.65
+# And of each channel of features: per node, whatever the measure.
+_PER_FEATURE = {2: 45.0, 3: 40.0}
+# And of the labels that pull: per probability that is held of each image, of which there are at most so many a node.
+_PER_PROBABILITY, _PROBABILITIES = 16.0, 32
 # And of reading, joining, judging and writing on the fixed grid, however coarse the finest level is.
 _FILES = {2: (65.0, 48.0), 3: (80.0, 26.0)}
+
+
+@dataclass(frozen=True)
+class Channels:
+    """How many channels the images have, and the features that are compared."""
+
+    images: int
+    features: int = 0
 
 
 def choices(settings: RegistrationSettings) -> tuple[dict[str, Measure], bool, bool]:
@@ -33,23 +47,34 @@ def choices(settings: RegistrationSettings) -> tuple[dict[str, Measure], bool, b
     return measures_in(settings.similarity.measure), settings.starts_discretely, settings.symmetric
 
 
-def footprint(grid: Grid, channels: int, settings: RegistrationSettings) -> int:
+def footprint(grid: Grid, channels: int | Channels, settings: RegistrationSettings) -> int:
     """Return about how many bytes a process holds at most that registers images on this grid, from files to files.
 
     Args:
         grid: of the fixed image, which the finest level has.
-        channels: of the images.
+        channels: of the images, and of features.
         settings: of the registration.
 
     Notes:
         Affine in the number of nodes; coarser levels are smaller by 2^D and do not count. Measured in float32 on a CPU,
         within 25 % from 64³ to 256³ and from 512² to 4096², and rather more than is taken beyond.
     """
-    measures, discrete, symmetric = choices(settings)
+    _, discrete, symmetric = choices(settings)
     maps = (2 if symmetric else 1) + _PER_SIDE * len(set(settings.sliding))
-    per_channel = sum(measure.memory[grid.dim - 2] for measure in measures.values())
-    rates = [(maps * _PER_NODE[grid.dim], maps * per_channel), *([_DISCRETE[grid.dim]] if discrete else [])]
-    return max(_affine(grid, channels, rate) for rate in rates) + _matrix(grid, settings)
+    per_channel = sum(measure.memory[grid.dim - 2] for measure in measures_in(settings.seen_by).values())
+    per_node = maps * (_PER_NODE[grid.dim] + _counted(channels).features * _PER_FEATURE[grid.dim])
+    rates = [(per_node, maps * per_channel), *([_DISCRETE[grid.dim]] if discrete else [])]
+    return max(_affine(grid, channels, rate) for rate in rates) + _matrix(grid, settings) + _labels(grid, settings)
+
+
+def _labels(grid: Grid, settings: RegistrationSettings) -> int:
+    """Return the bytes of the labels that pull, 0 where none does."""
+    held = min(MOST_PROBABILITIES, _PROBABILITIES * math.prod(grid.shape))
+    return round(_PER_PROBABILITY * held) if settings.labels_weight > 0 else 0
+
+
+def _counted(channels: int | Channels) -> Channels:
+    return Channels(channels) if isinstance(channels, int) else channels
 
 
 def _matrix(grid: Grid, settings: RegistrationSettings) -> int:
@@ -58,18 +83,18 @@ def _matrix(grid: Grid, settings: RegistrationSettings) -> int:
     return _PER_ENTRY * min(entries, LARGEST_MATRIX) if settings.solver.method == "assembled" else 0
 
 
-def _affine(grid: Grid, channels: int, rate: tuple[float, float]) -> int:
+def _affine(grid: Grid, channels: int | Channels, rate: tuple[float, float]) -> int:
     """Return the bytes of a process that holds so many for a node, and so many for a node and channel."""
     node, channel = rate
-    return round(_PROCESS_BYTES + (node + channels * channel) * math.prod(grid.shape))
+    return round(_PROCESS_BYTES + (node + _counted(channels).images * channel) * math.prod(grid.shape))
 
 
-def least_for(grid: Grid, channels: int, settings: RegistrationSettings) -> int:
+def least_for(grid: Grid, channels: int | Channels, settings: RegistrationSettings) -> int:
     """Return the bytes that a registration takes at least, however coarse its finest level is."""
     return min(_affine(grid, channels, _FILES[grid.dim]), footprint(grid, channels, settings))
 
 
-def advice(grid: Grid, free: int, channels: int, settings: RegistrationSettings) -> str:
+def advice(grid: Grid, free: int, channels: int | Channels, settings: RegistrationSettings) -> str:
     """Return what to do about a registration that takes more than the ``free`` bytes."""
     least = least_for(grid, channels, settings)
     if free < least:
@@ -77,7 +102,7 @@ def advice(grid: Grid, free: int, channels: int, settings: RegistrationSettings)
     return f"use --memory {at_least(free)} to register it on a coarser grid"
 
 
-def fitting_grid(grid: Grid, limit: int, channels: int, settings: RegistrationSettings) -> Grid:
+def fitting_grid(grid: Grid, limit: int, channels: int | Channels, settings: RegistrationSettings) -> Grid:
     """Return the finest grid of the same box on which a registration takes at most ``limit`` bytes.
 
     Args:

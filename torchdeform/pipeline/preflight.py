@@ -239,7 +239,7 @@ def _check_scale(fixed: Image, moving: Image, settings: RegistrationSettings) ->
     ranges = [float(high - low) for low, high in ends]
     if max(ranges) / max(min(ranges), 1e-30) > _SCALE_RATIO:
         text = f"{fixed.name} spans {ranges[0]:.4g} grey values and {moving.name} {ranges[1]:.4g}"
-        if needs_common_scale(settings.similarity.measure):
+        if needs_common_scale(settings.seen_by):
             yield Finding(WARNING, f"{text}; scale them alike, or use another similarity than ssd")
         else:
             yield Finding(NOTE, f"{text}; scale them alike if they are of one kind and you compare them by ssd")

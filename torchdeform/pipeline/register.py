@@ -23,12 +23,14 @@ from torchdeform.io.point_tables import FIXED, MOVING
 from torchdeform.io.points import matched, read_points
 from torchdeform.io.texts import read_json
 from torchdeform.metrics.evaluation import common_labels
-from torchdeform.pipeline.annotations import check_annotations
-from torchdeform.pipeline.memory import advice, fitting_grid, footprint
+from torchdeform.pipeline.annotations import check_annotations, check_features
+from torchdeform.pipeline.memory import Channels, advice, fitting_grid, footprint
 from torchdeform.pipeline.preflight import WARNING, Finding, Report, preflight
-from torchdeform.pipeline.tissue import check_tissue, contradiction
+from torchdeform.pipeline.tissue import check_tissue
+from torchdeform.pipeline.tissue import contradiction as unexplained_tissue
+from torchdeform.registration.channels import contradiction, count_features, settled
 from torchdeform.registration.deformable import resample_result
-from torchdeform.registration.problem import Annotations
+from torchdeform.registration.problem import PAIRED, Annotations
 from torchdeform.registration.result import Callback, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.figures import write_overview
@@ -64,6 +66,8 @@ class PairFiles:
         moving_points: the same landmarks in the moving image.
         fixed_labels: regions of the fixed image, whole numbers.
         moving_labels: the same regions of the moving image.
+        fixed_features: channels of the fixed image that are compared.
+        moving_features: the same channels of the moving image.
         tissue: labels of tissue, whole numbers, of the fixed image alone: the settings ``tissues`` and ``sliding`` say
             what they are.
     """
@@ -77,6 +81,8 @@ class PairFiles:
     moving_points: Path | None = None
     fixed_labels: Path | None = None
     moving_labels: Path | None = None
+    fixed_features: Path | None = None
+    moving_features: Path | None = None
     tissue: Path | None = None
 
     def given(self) -> dict[str, Path]:
@@ -84,8 +90,8 @@ class PairFiles:
         return {field.name: path for field in fields(self) if (path := getattr(self, field.name)) is not None}
 
     def require_pairs(self) -> None:
-        """Raise `InputError` if points or labels are given for one image only."""
-        for what in ("points", "labels"):
+        """Raise `InputError` if points, labels or features are given for one image only."""
+        for what in PAIRED:
             given = [getattr(self, f"{side}_{what}") is not None for side in ("fixed", "moving")]
             if given[0] != given[1]:
                 missing, other = ("moving", "fixed") if given[0] else ("fixed", "moving")
@@ -94,12 +100,13 @@ class PairFiles:
 
 @dataclass(frozen=True)
 class Inputs:
-    """What was read: two images, their masks, landmarks and labels, and sentences about what looks wrong."""
+    """What was read: two images, their annotations, how many features are compared, and what looks wrong."""
 
     fixed: Image
     moving: Image
     annotations: Annotations
     warnings: tuple[str, ...] = ()
+    features: int = 0
 
 
 @dataclass(frozen=True)
@@ -138,11 +145,15 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
         memory: bytes that a coarser grid keeps the registration to, see `preflight`.
 
     Raises:
-        InputError: a file cannot be read, `preflight` finds an error, landmarks or labels do not belong to their image,
-            or the settings of tissue do not go with its labels.
+        InputError: a file cannot be read, `preflight` finds an error, landmarks, labels or features do not belong to
+            their image, the settings do not go with the files, or a program makes no features.
     """
     files.require_pairs()
-    if problem := contradiction(files.tissue is not None, settings):
+    known = {"features": files.fixed_features is not None, "labels": files.fixed_labels is not None}
+    names = ("--fixed-features and --moving-features", "--fixed-labels and --moving-labels")
+    if problem := unexplained_tissue(files.tissue is not None, settings) or contradiction(
+        settings, **known, options=names
+    ):
         raise InputError(problem)
     fixed, moving = read_image(files.fixed), read_image(files.moving)
     masks = [read_optional(path) for path in (files.fixed_mask, files.moving_mask)]
@@ -165,6 +176,8 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
         fixed_labels=labels[0],
         moving_labels=labels[1],
         tissue=labels[2],
+        fixed_features=read_optional(files.fixed_features),
+        moving_features=read_optional(files.moving_features),
         **_read_points(files, fixed, moving),
     )
     annotations.require_images(fixed.grid.dim)
@@ -174,7 +187,8 @@ def read_inputs(files: PairFiles, settings: RegistrationSettings, memory: int | 
         first = resample(labels[0], fixed, mode="nearest")
         common_labels(first, labels[1].data, names=(labels[0].name, labels[1].name))
     remarks = [text for image in labels if image is not None for text in image.remarks]
-    return Inputs(fixed, moving, annotations, (*report.of(WARNING), *found.of(WARNING), *remarks))
+    features = count_features(settled(settings, annotations), fixed, moving, annotations)
+    return Inputs(fixed, moving, annotations, (*report.of(WARNING), *found.of(WARNING), *remarks), features)
 
 
 def _check_annotations(
@@ -185,6 +199,8 @@ def _check_annotations(
         points, labels = (getattr(annotations, f"{side}_{what}") for what in ("points", "labels"))
         positions = None if points is None else points[0].T
         yield from check_annotations(image, positions, getattr(files, f"{side}_points"), labels)
+    if annotations.features:
+        yield from check_features(images, annotations.features)
     if isinstance(annotations.tissue, Image):
         yield from check_tissue(images[0], annotations.tissue, settings)
 
@@ -238,12 +254,13 @@ def register_files(
     _require_no_folders(files.out)
     begin("reading")
     inputs = read_inputs(files, settings, memory)
-    fixed, notes = _fit_to_memory(inputs.fixed, settings, memory, where)
+    settings = settled(settings, inputs.annotations)
+    fixed, notes = _fit_to_memory(inputs, settings, memory, where)
     run = _Run(memory, {"read": perf_counter() - start}, {"read": peak()})
     moving, annotations = inputs.moving.to(where), inputs.annotations.to(where)
     placed = place(fixed.to(where), moving, settings, annotations)
     if placed.choice:  # what was chosen may take more
-        fixed, notes = _fit_to_memory(inputs.fixed, placed.settings, memory, where)
+        fixed, notes = _fit_to_memory(inputs, placed.settings, memory, where)
     result = register(fixed.to(where), moving, settings, annotations=annotations, affine=placed, callback=callback)
     if fixed is not inputs.fixed:  # a coarser grid was registered
         result = resample_result(result, inputs.fixed.to(where), moving, annotations)
@@ -263,10 +280,11 @@ class _Run:
 
 
 def _fit_to_memory(
-    fixed: Image, settings: RegistrationSettings, memory: int | None, device: torch.device
+    inputs: Inputs, settings: RegistrationSettings, memory: int | None, device: torch.device
 ) -> tuple[Image, tuple[str, ...]]:
     """Return the fixed image on the finest grid that memory allows, and a sentence if that grid is coarser."""
-    channels = fixed.data.shape[1]
+    fixed = inputs.fixed
+    channels = Channels(fixed.data.shape[1], inputs.features)
     need, free = footprint(fixed.grid, channels, settings), available(device)
     if memory is None:
         if free is not None and need > free:

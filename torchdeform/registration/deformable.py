@@ -18,8 +18,9 @@ from torchdeform.core.warp import invert, warp
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.metrics.evaluation import evaluate_images, evaluate_tensors
 from torchdeform.metrics.similarity import mark
-from torchdeform.registration.absence import let_go, moved_with
+from torchdeform.registration.absence import Regions, let_go, moved_with
 from torchdeform.registration.agreement import disagreement
+from torchdeform.registration.channels import count_features, settled, with_channels
 from torchdeform.registration.discrete import discrete_start
 from torchdeform.registration.evidence import gather_evidence, to_compare, with_labels
 from torchdeform.registration.optimise import best_map, common_mask, forward_objective, held_still, optimise_levels
@@ -62,7 +63,7 @@ def register(
         fixed: image that stays: ``(B, C, *S)`` with a pair per item, or an `Image`.
         moving: image that is warped; a tensor of the same shape, or an `Image` anywhere in the same world.
         config: settings; those of the preset ``default`` when None.
-        annotations: masks, landmarks and labels.
+        annotations: masks, landmarks, labels and features.
         affine: map A from the world of the fixed image to that of the moving one, for images, or what `place` returned
             for them; when None, that which `align` finds as ``config.align`` says.
         start: displacement ``(B, D, *S)`` in units of spacing to begin with, fold-free; what the coarsest level cannot
@@ -87,7 +88,8 @@ def register(
         Landmarks add the force of their squared distance at the points. With ``symmetric`` two maps from a space
         between move against each other, and φ = φ_m ∘ φ_f⁻¹.
     """
-    settings, annotations = config or RegistrationSettings(), annotations or Annotations()
+    annotations = annotations or Annotations()
+    settings = settled(config or RegistrationSettings(), annotations)
     if isinstance(fixed, Image) and isinstance(moving, Image):
         return _register_images(fixed, moving, settings, annotations, affine, start, callback)
     if isinstance(fixed, Image) or isinstance(moving, Image):
@@ -110,7 +112,7 @@ def _register_tensors(
     require_finite(problem.fixed, problem.moving, "register")
     settings = settings.decided()  # items of a batch may not choose for each other
     problem = replace(problem, tissue=_tissue(annotations.tissue, settings, fixed))
-    problem, regions = let_go(problem.scaled(settings), settings)
+    problem, regions = _ready(problem, settings)
     space = midspace_of_tensors(problem) if settings.symmetric else None
     found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
     del problem, space
@@ -120,6 +122,12 @@ def _register_tensors(
     absent = moved_with(regions, found.u, grid)
     result = replace(_result(found, grid, warped, settings), evaluation=evaluation, absent=absent)
     return _examined(result, compared, (fixed, moving), annotations.labels)
+
+
+def _ready(problem: RegistrationProblem, settings: RegistrationSettings) -> tuple[RegistrationProblem, Regions | None]:
+    """Return the problem on its scale, with all that is compared and without what is let go, and where that is."""
+    problem, regions = let_go(problem.scaled(settings), settings)
+    return with_channels(problem, settings), regions
 
 
 def _on(labels: Tensor | Image | None, fixed: Image) -> Tensor | None:
@@ -182,10 +190,15 @@ def _register_images(
 ) -> RegistrationResult:
     """Take the moving image onto the fixed grid in its physical place, register, and sample the original once."""
     annotations.require_images(fixed.grid.dim)
-    placed = affine if isinstance(affine, Placement) else place(fixed, moving, settings, annotations, affine)
-    both, settings, affine = placed_images(fixed, moving, annotations), placed.settings, placed.affine
+    if isinstance(affine, Placement):
+        placed = affine
+    else:
+        count_features(settings, fixed, moving, annotations)  # what a program cannot do shows before the alignment
+        placed = place(fixed, moving, settings, annotations, affine)
+    pulling = annotations if settings.labels_weight > 0 else replace(annotations, fixed_labels=None, moving_labels=None)
+    both, settings, affine = placed_images(fixed, moving, pulling), placed.settings, placed.affine
     problem = replace(problem_at(*both, affine), tissue=_tissue(_on(annotations.tissue, fixed), settings, fixed.data))
-    problem, regions = let_go(problem.scaled(settings), settings)
+    problem, regions = _ready(problem, settings)
     space = _midspace(*both, problem, affine, settings) if settings.symmetric else None
     found, compared = _optimise(problem, space, settings, start, callback), to_compare(problem)
     del problem, space
@@ -220,7 +233,7 @@ def _midspace(
     if affine is None and same_place(fixed.image, moving.image):
         return midspace_of_tensors(problem)
     space = midspace_of_images(fixed, moving, affine, common_axes(fixed.image, moving.image))
-    return replace(space, problem=let_go(space.problem.scaled(settings), settings)[0])
+    return replace(space, problem=_ready(space.problem, settings)[0])
 
 
 def _warped(fixed: Image, moving: Image, affine: Affine | None, u: Tensor, settings: RegistrationSettings) -> Tensor:
@@ -273,17 +286,18 @@ def _optimise(
         values = before, after
         if problem.tissue is not None:
             u, kept = problem.tissue.corrected(u, problem.grid, settings.folds.min_determinant, problem.held)
-            values = tuple(objective.similarity.on_common_voxels([zero, u]))
-        marks = values if settings.similarity.measure == "lncc" else _marks(problem, settings, zero, u)
+            values = tuple(objective.on_common_voxels([zero, u], [zero, u]))
+        known = settings.similarity.measure == "lncc" and not problem.channels
+        marks = values if known else _marks(problem, settings, zero, u)
     return _Optimised(u, records, values, marks, perf_counter() - began, kept)
 
 
 def _marks(problem: RegistrationProblem, settings: RegistrationSettings, *maps: Tensor) -> tuple[Tensor, ...]:
     """Return the `mark` of the images warped by each of the maps, over the voxels that all of them see."""
-    grid, chosen = problem.grid, settings.similarity
+    grid, measure, window = problem.grid, settings.seen_by, settings.similarity.window
     mask = common_mask(problem.fixed_mask, problem.moving_mask, maps, grid)
     found = (warp(problem.moving, u, grid) for u in maps)
-    return tuple(mark(chosen.measure, problem.fixed, w, mask=mask, window=chosen.window, grid=grid) for w in found)
+    return tuple(mark(measure, problem.fixed, w, mask=mask, window=window, grid=grid) for w in found)
 
 
 def _checked_start(start: Tensor, problem: RegistrationProblem) -> Tensor:

@@ -93,7 +93,7 @@ class Evidence:
 def to_compare(problem: RegistrationProblem) -> RegistrationProblem:
     """Return one channel of a problem on a grid of few nodes and on the CPU, all that `gather_evidence` needs."""
     grey = {name: getattr(problem, name).mean(1, keepdim=True) for name in ("fixed", "moving")}
-    few = replace(problem, **grey, fixed_points=None, moving_points=None)
+    few = replace(problem, **grey, fixed_points=None, moving_points=None, channels=(), intensities=True)
     few = few.on(with_nodes(problem.grid, _DETAIL[problem.grid.dim]))
     return replace(few, **{name: None if field is None else field.cpu() for name, field in _fields(few).items()})
 

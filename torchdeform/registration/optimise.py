@@ -21,7 +21,7 @@ from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity, weighted
 from torchdeform.metrics.similarity import features, make_similarity
 from torchdeform.registration.landmarks import ForwardLandmarks, Landmarks
-from torchdeform.registration.problem import RegistrationProblem
+from torchdeform.registration.problem import Channels, RegistrationProblem
 from torchdeform.registration.result import Callback, LevelRecord, Progress
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.tissue import Tissue
@@ -122,27 +122,83 @@ def common_mask(fixed: Tensor | None, moving: Tensor | None, maps: Sequence[Tens
     return mask
 
 
-def forward_similarity(problem: RegistrationProblem, settings: RegistrationSettings) -> SimilarityTerm:
-    """Return the similarity of the fixed and the warped moving image."""
-    measure, window = settings.similarity.measure, settings.similarity.window
+def compared(problem: RegistrationProblem, settings: RegistrationSettings) -> tuple[Channels, ...]:
+    """Return all that is compared: what a measure takes of the intensities, if they are, and other channels."""
+    if not problem.intensities:
+        return problem.channels
+    measure = settings.similarity.measure
     fixed, moving = (features(measure, image) for image in (problem.fixed, problem.moving))
-    similarity = make_similarity(measure, fixed, window, grid=problem.grid)
-    return SimilarityTerm(problem.grid, moving, similarity, problem.moving_mask, problem.fixed_mask)
+    return Channels(problem.grid, fixed, moving, measure), *problem.channels
+
+
+def forward_similarity(
+    problem: RegistrationProblem, channels: Channels, settings: RegistrationSettings
+) -> SimilarityTerm:
+    """Return the similarity of the fixed and the warped moving channels."""
+    similarity = make_similarity(channels.measure, channels.fixed, settings.similarity.window, grid=channels.grid)
+    fixed_mask, moving_mask = problem.masks_on(channels.grid)
+    return SimilarityTerm(channels.grid, channels.moving, similarity, moving_mask, fixed_mask)
+
+
+@dataclass(frozen=True)
+class Addition:
+    """A similarity that is added to that of the images.
+
+    Attributes:
+        similarity: S, on its grid.
+        weight: of S.
+        transfer: between its grid and that of the map, None where they are one.
+    """
+
+    similarity: SimilarityTerm
+    weight: float
+    transfer: Transfer | None = None
+
+    def evaluate(self, u: Tensor, stencil: str) -> tuple[Tensor, Tensor]:
+        """Return what is added for maps u ``(B, D, *S)``, and its force N ∂S/∂u likewise, N being that of the nodes."""
+        term = self.similarity
+        warped, value, slope = term.evaluate(self._at(u))
+        force = image_force(slope, warped, term.grid, stencil) * (self.weight / warped.shape[1])
+        return self.weight * value, force if self.transfer is None else self.transfer.gather(force)
+
+    def on_common_voxels(self, maps: Sequence[Tensor]) -> list[Tensor]:
+        """Return what is added for each of the maps, over the voxels that all of them see."""
+        return [self.weight * value for value in self.similarity.on_common_voxels([self._at(u) for u in maps])]
+
+    def _at(self, u: Tensor) -> Tensor:
+        return u if self.transfer is None else self.transfer.up(u)
 
 
 @dataclass(frozen=True)
 class Objective:
-    """What is maximised on the grid of one level, S − points_weight · E, and which maps move together.
+    """What is maximised on the grid of one level, S + Σ wₖ Sₖ − points_weight · E, and which maps move together.
 
     Attributes:
         similarity: S of the images, on their grid.
         landmarks: E of the pairs of points, on the grid of the map; None without.
         coupling: of the maps.
+        more: wₖ Sₖ.
     """
 
     similarity: Any
     landmarks: Landmarks | None = None
     coupling: Coupling = _FREE
+    more: tuple[Addition, ...] = ()
+
+    def on_common_voxels(self, maps: Sequence[Tensor], at_images: Sequence[Tensor]) -> list[Tensor]:
+        """Return S + Σ wₖ Sₖ of the maps, which are given on the grid of the images too, over what all of them see."""
+        values = self.similarity.on_common_voxels(at_images)
+        for addition in self.more:
+            values = [value + other for value, other in zip(values, addition.on_common_voxels(maps), strict=True)]
+        return values
+
+
+def additions(terms: Sequence[SimilarityTerm], channels: Sequence[Channels], grid: Grid) -> tuple[Addition, ...]:
+    """Return the similarities of channels with their weights, the map being on ``grid``."""
+    return tuple(
+        Addition(term, one.weight, Transfer(term.grid, grid, term.images) if term.grid != grid else None)
+        for term, one in zip(terms, channels, strict=True)
+    )
 
 
 # From the problem on a level's grid, the grid of its map, and the settings.
@@ -230,7 +286,9 @@ class State:
 def forward_objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
     """Return what is maximised where the moving image is warped onto the fixed one, the map being on ``grid``."""
     pairs = problem.pairs if settings.points_weight > 0 else None
-    return Objective(forward_similarity(problem, settings), pairs and ForwardLandmarks(*pairs, grid))
+    channels = compared(problem, settings)
+    first, *others = [forward_similarity(problem, one, settings) for one in channels]
+    return Objective(first, pairs and ForwardLandmarks(*pairs, grid), more=additions(others, channels[1:], grid))
 
 
 def optimise_levels(
@@ -334,7 +392,7 @@ def best_map(
         maps: displacements ``(B, D, *S)``; of equal ones the last is returned.
         level: whose maps they are; None for maps on the grid of the images.
     """
-    values = objective.similarity.on_common_voxels([level.at_images(u) if level else u for u in maps])
+    values = objective.on_common_voxels(maps, [level.at_images(u) if level else u for u in maps])
     goals = values
     if objective.landmarks:
         distances = [objective.landmarks.evaluate(u).distance for u in maps]
@@ -350,17 +408,20 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     """Return the state after one step, and whether it was the last."""
     settings, objective, grid = level.settings, level.objective, level.grid
     # 1. Evaluate: warp the images, compare them, and see how far the landmarks are apart.
+    more = [addition.evaluate(state.u, settings.stencil) for addition in objective.more]
     at_images = level.at_images(state.u)
     warped, value, slope = objective.similarity.evaluate(at_images)
+    value = sum((added for added, _ in more), start=value)
     points = objective.landmarks.evaluate(state.u) if objective.landmarks else None
     del at_images
     state = _judged(level, state, value, None if points is None else points.distance)
     if level.keep_best and (step == level.steps or not bool(state.active.any())):
         return state, True
     # 2. Force: steepest ascent of the similarity asks for N ∂S/∂warped ∇warped, the landmarks pull at their points.
-    force = image_force(slope, warped, objective.similarity.grid, settings.stencil)
+    force, channels = image_force(slope, warped, objective.similarity.grid, settings.stencil), warped.shape[1]
     del warped, slope  # before the next are made
     force = force if level.transfer is None else level.transfer.gather(force)
+    force = sum((channels * added for _, added in more), start=force)  # N counts the channels of the images
     scale = settings.points_weight * math.prod(grid.shape)  # to the unit of N ∂S/∂warped
     load = None if points is None else points.load(grid) * scale
     # 3. Least squares: div and curl of the velocity are paid for, nearly folded places ask for divergence.

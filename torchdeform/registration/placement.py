@@ -72,7 +72,7 @@ def place(
         Where tissue is to keep its shape or its volume, ``similarity`` and ``affine`` become ``rigid``.
     """
     settings = _keeping_tissue(settings)
-    both, alignment = placed_images(fixed, moving, annotations), None
+    both, alignment = placed_images(fixed, moving, annotations.masks), None
     if affine is None and settings.align.kind != "none":
         alignment = _align(fixed, moving, settings, annotations)
         affine = alignment.affine
@@ -110,9 +110,9 @@ def problem_at(fixed: PlacedImage, moving: PlacedImage, affine: Affine | None) -
 
 def _marked(problem: RegistrationProblem, settings: RegistrationSettings) -> tuple[Tensor, Tensor]:
     """Return mark and merit of two images on their scale, each ``(B,)``."""
-    mask, chosen = problem.mask, settings.similarity
-    found = mark(chosen.measure, problem.fixed, problem.moving, mask=mask, window=chosen.window, grid=problem.grid)
-    contrast = local_contrast(problem.fixed, chosen.window)
+    mask, window = problem.mask, settings.similarity.window
+    found = mark(settings.seen_by, problem.fixed, problem.moving, mask=mask, window=window, grid=problem.grid)
+    contrast = local_contrast(problem.fixed, window)
     counted, seen = (weighted(contrast, given) for given in (problem.fixed_mask, mask))
     return found, found * (seen.flatten(1).sum(1) / counted.flatten(1).sum(1))
 
@@ -144,6 +144,8 @@ def choose(problem: RegistrationProblem, settings: RegistrationSettings) -> tupl
     """
     if settings.similarity.measure != AUTO:
         return settings.decided(), None
+    if settings.only_features:
+        return settings.decided(), "similarity ssd: features are compared by the squared difference of unit vectors"
     agreement = sign_agreement(problem)
     measure = "lncc" if agreement >= _ONE_CONTRAST else "mind"
     kind = "one contrast" if measure == "lncc" else "different contrasts"

@@ -1,8 +1,9 @@
 """What is registered, on one grid: the images as they are compared, where they count, which points belong together."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,6 +20,12 @@ from torchdeform.metrics.correlation import lncc
 from torchdeform.metrics.similarity import needs_common_scale
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.tissue import Tissue
+
+T = TypeVar("T")
+
+# What is given of both images or of none.
+PAIRED = ("points", "labels", "features")
+_FEATURES = ("fixed_features", "moving_features")
 
 # Slices are far apart where they are so many times farther than the nodes and the pixels.
 _SPARSE = 3.0
@@ -42,12 +49,16 @@ class Annotations:
             images in the world, (x, y, z) in mm.
         moving_points: the same landmarks in the moving image, in the same order.
         fixed_labels: whole numbers ``(B, 1, *S)``, 0 for what is not looked at; or an `Image` of them.
-        moving_labels: likewise of the moving image. Labels are only measured.
+        moving_labels: likewise of the moving image. Labels are only measured, unless ``labels_weight`` is positive.
+        fixed_features: channels to compare ``(B or 1, K, *S)``, or an `Image` of them, on any grid; see ``features`` in
+            `RegistrationSettings`.
+        moving_features: the same channels of the moving image.
         tissue: whole numbers on the fixed image, as ``fixed_labels``; what they stand for say the settings ``tissues``
             and ``sliding``.
 
     Raises:
-        InputError: points or labels of one image only, or points whose shapes do not fit or that are not finite.
+        InputError: points, labels or features of one image only, or points whose shapes do not fit or that are not
+            finite.
     """
 
     fixed_mask: Tensor | Image | None = None
@@ -56,10 +67,12 @@ class Annotations:
     moving_points: Tensor | None = None
     fixed_labels: Tensor | Image | None = None
     moving_labels: Tensor | Image | None = None
+    fixed_features: Tensor | Image | None = None
+    moving_features: Tensor | Image | None = None
     tissue: Tensor | Image | None = None
 
     def __post_init__(self) -> None:
-        for name in ("points", "labels"):
+        for name in PAIRED:
             given = [getattr(self, f"{side}_{name}") is not None for side in ("fixed", "moving")]
             if given[0] != given[1]:
                 missing = "fixed" if given[1] else "moving"
@@ -75,7 +88,17 @@ class Annotations:
     @property
     def labels(self) -> tuple[Any, Any] | None:
         """The labels of both images, None without."""
-        return None if self.fixed_labels is None else (self.fixed_labels, self.moving_labels)
+        return _both(self.fixed_labels, self.moving_labels)
+
+    @property
+    def features(self) -> tuple[Any, Any] | None:
+        """The features of both images, None without."""
+        return _both(self.fixed_features, self.moving_features)
+
+    @property
+    def masks(self) -> "Annotations":
+        """The masks alone."""
+        return Annotations(fixed_mask=self.fixed_mask, moving_mask=self.moving_mask)
 
     @property
     def points(self) -> tuple[Tensor, Tensor] | None:
@@ -88,6 +111,9 @@ class Annotations:
             field = getattr(self, name)
             if field is not None:
                 _require_field(field, name, grid, items)
+        for name in _FEATURES if self.features else ():
+            _require_features(getattr(self, name), name, grid, items)
+        _require_one_count(self.features, _FEATURES)
         if self.fixed_points is not None and tuple(self.fixed_points.shape[:2]) != (items, grid.dim):
             given = tuple(self.fixed_points.shape)
             raise InputError(f"fixed_points must have shape ({items}, {grid.dim}, n), got {given}")
@@ -103,8 +129,38 @@ class Annotations:
             if field.grid.dim != dim or field.data.shape[1] != 1:
                 kind = f"{field.grid.dim}D with {field.data.shape[1]} channels"
                 raise InputError(f"{name}: {field.name} must be {dim}D with one channel, but is {kind}; choose another")
+        for name, field in zip(_FEATURES, self.features or (), strict=False):
+            _require_feature_image(field, name, dim)
+        both = self.features and tuple(image.data for image in self.features)
+        _require_one_count(both, tuple(image.name for image in self.features or ()))
         if self.fixed_points is not None and tuple(self.fixed_points.shape[:2]) != (1, dim):
             raise InputError(f"fixed_points must have shape (1, {dim}, n), got {tuple(self.fixed_points.shape)}")
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Something of both images that is compared, made once and averaged down.
+
+    Attributes:
+        grid: their grid, which may be coarser than that of the images.
+        fixed: ``(B, C, *S)``.
+        moving: the same shape.
+        measure: the similarity, or several with weights.
+        weight: of S, relative to that of what comes first.
+    """
+
+    grid: Grid
+    fixed: Tensor
+    moving: Tensor
+    measure: str | Mapping[str, float]
+    weight: float = 1.0
+
+    def on(self, coarse: Grid) -> "Channels":
+        """Return them on a grid of the same box, if it is coarser."""
+        if math.prod(coarse.shape) >= math.prod(self.grid.shape):
+            return self
+        fixed, moving = (restrict(field, self.grid, coarse) for field in (self.fixed, self.moving))
+        return Channels(coarse, fixed, moving, self.measure, self.weight)
 
 
 @dataclass(frozen=True)
@@ -123,6 +179,10 @@ class RegistrationProblem:
         tissue: what the fixed image is made of, None where nothing is said.
         sides: how much of each node belongs to each side of borders that glide ``(B or 1, K, *S)``, where the pairs are
             those of every side and item; None without.
+        features: channels of both images as they are given, or None.
+        labels: of both images, whole numbers ``(B, 1, *S)``, where they are compared; or None.
+        channels: what is compared beside the intensities, or in their place.
+        intensities: whether these are compared.
     """
 
     grid: Grid
@@ -135,6 +195,10 @@ class RegistrationProblem:
     held: tuple[int, ...] = ()
     tissue: Tissue | None = None
     sides: Tensor | None = None
+    features: tuple[Tensor, Tensor] | None = None
+    labels: tuple[Tensor, Tensor] | None = None
+    channels: tuple[Channels, ...] = ()
+    intensities: bool = True
 
     @property
     def pairs(self) -> tuple[Tensor, Tensor] | None:
@@ -157,14 +221,20 @@ class RegistrationProblem:
         masks = {name: coarser(getattr(self, name)) for name in ("fixed_mask", "moving_mask", "sides")}
         images = {"fixed": restrict(self.fixed, self.grid, coarse), "moving": restrict(self.moving, self.grid, coarse)}
         tissue = self.tissue and self.tissue.on(self.grid, coarse)
-        return replace(self, grid=coarse, tissue=tissue, **images, **masks)
+        channels = tuple(one.on(coarse) for one in self.channels)
+        return replace(self, grid=coarse, tissue=tissue, channels=channels, **images, **masks)
+
+    def masks_on(self, grid: Grid) -> tuple[Tensor | None, Tensor | None]:
+        """Return the fixed and the moving mask on a grid that is no finer, None for 1 everywhere."""
+        fixed, moving = (m if m is None else restrict(m, self.grid, grid) for m in (self.fixed_mask, self.moving_mask))
+        return fixed, moving
 
     def scaled(self, settings: RegistrationSettings) -> "RegistrationProblem":
         """Return the problem with intensities on the scale that the similarity needs."""
         images = to_common_scale(
             (self.fixed, self.moving),
             (self.fixed_mask, self.moving_mask),
-            jointly=needs_common_scale(settings.similarity.measure),
+            jointly=needs_common_scale(settings.seen_by),
         )
         return replace(self, fixed=images[0], moving=images[1])
 
@@ -174,7 +244,14 @@ def problem_of_tensors(fixed: Tensor, moving: Tensor, grid: Grid, annotations: A
     masks = [_weights(mask, fixed) for mask in (annotations.fixed_mask, annotations.moving_mask)]
     images = [image if mask is None else fill(image, mask) for image, mask in zip((fixed, moving), masks, strict=True)]
     points = [None if p is None else p.to(fixed) for p in (annotations.fixed_points, annotations.moving_points)]
-    return RegistrationProblem(grid, *images, *masks, *points, held=_thin_axes(grid))
+    features, labels = (_for_items(pair, fixed) for pair in (annotations.features, annotations.labels))
+    held = _thin_axes(grid)
+    return RegistrationProblem(grid, *images, *masks, *points, held=held, features=features, labels=labels)
+
+
+def _for_items(pair: tuple[Tensor, Tensor] | None, like: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Return two fields with an entry for every item of a batch, None without."""
+    return pair and _both(*(field.to(like.device).expand(len(like), *field.shape[1:]) for field in pair))
 
 
 def _weights(mask: object, like: Tensor) -> Tensor | None:
@@ -189,17 +266,21 @@ class PlacedImage:
         image: channels that are compared, filled in where the mask is 0.
         mask: 0 and 1 on the image's grid, or None.
         points: landmarks in the world ``(1, D, n)``, float64, or None.
+        features: channels on a grid of their own, or None.
+        labels: likewise, or None.
     """
 
     image: Image
     mask: Image | None
     points: Tensor | None
+    features: Image | None = None
+    labels: Image | None = None
 
     def moved(self, affine: Affine) -> "PlacedImage":
         """Return the image, its mask and its points at the place where an affine map of the world takes it."""
-        mask = None if self.mask is None else moved(self.mask, affine)
+        mask, features, labels = (f and moved(f, affine) for f in (self.mask, self.features, self.labels))
         points = None if self.points is None else affine(self.points)
-        return PlacedImage(moved(self.image, affine), mask, points)
+        return PlacedImage(moved(self.image, affine), mask, points, features, labels)
 
 
 def moved(image: Image, affine: Affine) -> Image:
@@ -220,20 +301,23 @@ def placed_images(fixed: Image, moving: Image, annotations: Annotations) -> tupl
         InputError: channels that do not correspond, masks that are empty, pixels that count but are NaN or all equal.
     """
     images = corresponding_channels(fixed, moving)
-    first = _placed(images[0], annotations.fixed_mask, annotations.fixed_points)
-    return first, _placed(images[1], annotations.moving_mask, annotations.moving_points)
+    first = _placed(images[0], annotations, "fixed")
+    return first, _placed(images[1], annotations, "moving")
 
 
-def _placed(image: Image, mask: Tensor | Image | None, points: Tensor | None) -> PlacedImage:
+def _placed(image: Image, annotations: Annotations, side: str) -> PlacedImage:
+    mask, points, *others = (
+        getattr(annotations, f"{side}_{name}") for name in ("mask", "points", "features", "labels")
+    )
     points = None if points is None else points.double().to(image.data.device)
     if not isinstance(mask, Image):
         require_registrable(image)
-        return PlacedImage(image, None, points)
+        return PlacedImage(image, None, points, *others)
     inside = resample(replace(mask, data=(mask.data != 0).to(image.data)), image, mode="nearest")
     require_mask(inside, mask.name)
     image = replace(image, data=fill(image.data, inside))
     require_registrable(image)
-    return PlacedImage(image, replace(image, data=inside), points)
+    return PlacedImage(image, replace(image, data=inside), points, *others)
 
 
 def resample_pair(fixed: PlacedImage, moving: PlacedImage, frame: Image) -> RegistrationProblem:
@@ -250,13 +334,26 @@ def resample_pair(fixed: PlacedImage, moving: PlacedImage, frame: Image) -> Regi
     weights = [None if mask is None else mask.to(like) for mask in masks]
     across = [axis for part in (fixed, moving) if (axis := _across(part.image, frame)) is not None]
     held = tuple(sorted({*_thin_axes(frame.grid), *across}))
+    features, labels = (_pair_on(frame, fixed, moving, name) for name in ("features", "labels"))
 
     def seen(thickness: float) -> RegistrationProblem:
         images = _averaged(fixed.image, moving.image, thickness), _averaged(moving.image, fixed.image, thickness)
-        return RegistrationProblem(frame.grid, *_seen(*images, frame), *weights, *points, held=held)
+        both = _seen(*images, frame)
+        return RegistrationProblem(frame.grid, *both, *weights, *points, held=held, features=features, labels=labels)
 
     thick = any(_sparse_axis(_steps(a.image, b.image)) is not None for a, b in ((fixed, moving), (moving, fixed)))
     return max(map(seen, _THICKNESSES), key=_likeness) if thick else seen(0.0)
+
+
+def _pair_on(frame: Image, fixed: PlacedImage, moving: PlacedImage, name: str) -> tuple[Tensor, Tensor] | None:
+    """Return the features or the labels of both images on the frame, None where they are not given."""
+    first, second = (getattr(placed, name) for placed in (fixed, moving))
+    if first is None or second is None:
+        return None
+    if name == "labels":
+        return resample(first, frame, mode="nearest"), resample(second, frame, mode="nearest")
+    like = fixed.image.data
+    return resample(first, frame, outside=None).to(like), resample(second, frame, outside=None).to(like)
 
 
 def _likeness(problem: RegistrationProblem) -> float:
@@ -369,7 +466,7 @@ def _mask_on(frame: Image, placed: PlacedImage) -> Tensor | None:
     return None if bool((weights == 1).all()) else weights
 
 
-def _both(first: Tensor | None, second: Tensor | None) -> tuple[Tensor, Tensor] | None:
+def _both(first: T | None, second: T | None) -> tuple[T, T] | None:
     return None if first is None or second is None else (first, second)
 
 
@@ -388,6 +485,28 @@ def _require_field(field: Tensor | Image, name: str, grid: Grid, items: int) -> 
         raise InputError(f"{name} must have shape {(items, 1, *grid.shape)}, got {tuple(field.shape)}")
     if name.endswith("mask"):
         require_mask(field, name)
+
+
+def _require_features(field: Tensor | Image, name: str, grid: Grid, items: int) -> None:
+    if not isinstance(field, Tensor) or field.shape[:1] not in ((1,), (items,)) or field.shape[2:] != grid.shape:
+        raise InputError(f"{name} must be a tensor {(items, 'K', *grid.shape)}, because the images are tensors")
+    if not bool(field.isfinite().all()):
+        raise InputError(f"{name} has values that are NaN or infinite; make them finite")
+
+
+def _require_feature_image(field: Tensor | Image, name: str, dim: int) -> None:
+    if not isinstance(field, Image):
+        raise InputError(f"{name} must be an Image, because the images are")
+    if field.grid.dim != dim:
+        raise InputError(f"{name}: {field.name} must be {dim}D as the images are, but is {field.grid.dim}D")
+    if not bool(field.data.isfinite().all()):
+        raise InputError(f"{name}: {field.name} has values that are NaN or infinite; make them finite")
+
+
+def _require_one_count(features: tuple[Tensor, Tensor] | None, names: tuple[str, ...]) -> None:
+    if features is not None and features[0].shape[1] != features[1].shape[1]:
+        counts = " and ".join(f"{n} has {f.shape[1]} channels" for n, f in zip(names, features, strict=True))
+        raise InputError(f"{counts}; features of both images must be the same channels")
 
 
 def require_mask(mask: Tensor, name: str) -> None:

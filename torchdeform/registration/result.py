@@ -136,4 +136,5 @@ class RegistrationResult:
             warnings=self.warnings,
             unit=self.unit,
             tissue=self.tissue,
+            labels_pulled=self.settings.labels_weight > 0,
         )

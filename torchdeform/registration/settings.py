@@ -1,18 +1,23 @@
 """Settings of a registration, nested by subject: typed, frozen, checked when made."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 from torchdeform.core.flow import OdeSolver
 from torchdeform.core.image import AUTO
-from torchdeform.errors import RANGES, InputError, require_choice, require_ranges
+from torchdeform.errors import RANGES, InputError, require_choice, require_ranges, shown
 from torchdeform.fem.solver import SolverSettings
-from torchdeform.metrics.similarity import similarity_weights
+from torchdeform.metrics.similarity import MEASURES, similarity_weights, weights_of
 from torchdeform.registration.affine.settings import AlignmentSettings
 
 OFF = "off"
 STARTS = (AUTO, "identity", "discrete")
+
+# Features that need no program: the images themselves, self-similarities, and channels that come in files.
+INTENSITIES, MIND, FILES = "intensities", "mind", "files"
 
 # What the kinds of tissue cost, beside div 0.5, curl 1 and strain 0 of what is not named.
 TISSUES: dict[str, dict[str, float]] = {
@@ -240,6 +245,15 @@ class RegistrationSettings:
             ``auto``, whichever is faster; the values are the same.
         points_weight: what landmarks weigh against the similarity: the mean of |φ(p) − q|² over the pairs, in squared
             units of spacing (mm² for images), is multiplied by this and taken off; 0 only measures them.
+        features: what takes the place of the intensities where images are compared, made once at full size: ``mind``; a
+            file of a TorchScript or ``torch.export`` program, or anything that can be called, which gets the image,
+            scaled to about [0, 1], as ``(1, C, *S)`` and returns ``(1, K, *S)``; or ``files``, the features of the
+            `Annotations`, which need not be said. Or several with their weights, as ``{intensities: 1, net.ts: 0.5}``,
+            of which the first has weight 1. Features alone are compared as ``similarity`` says, ``auto`` being ``ssd``
+            of unit vectors; beside ``intensities`` they are compared so, and ``similarity`` is of these.
+        labels_weight: what the labels of both images weigh against the similarity: the squared difference of their
+            smooth probabilities, −1 where none overlaps and 0 where all do, is added with this weight; 0 only measures
+            them.
         symmetric: prefer neither image: both are warped into a space between, so that swapping them inverts the map.
         outside: value of ``warped`` where an image (not a tensor) does not reach: a number, or ``auto`` for what
             surrounds it, the grey value of its border if that is nearly constant, else its minimum.
@@ -266,6 +280,8 @@ class RegistrationSettings:
     folds: FoldSettings = _FOLDS
     stencil: str = "auto"
     points_weight: float = 0.0
+    features: Any = None
+    labels_weight: float = 0.0
     symmetric: bool = False
     outside: float | str = AUTO
     absent: str | bool = AUTO
@@ -292,7 +308,53 @@ class RegistrationSettings:
             require_choice(self.outside, (AUTO,), "outside, if it is no number,")
         else:
             require_ranges(self, "", outside=(math.isfinite, "be finite"))
-        require_ranges(self, "", points_weight="finite, not negative")
+        require_ranges(self, "", points_weight="finite, not negative", labels_weight="finite, not negative")
+        self._check_features()
+
+    def _check_features(self) -> None:
+        if isinstance(self.features, Mapping):
+            object.__setattr__(self, "features", dict(self.features))
+        for name in self.sources:
+            if not callable(name) and not (isinstance(name, str | Path) and str(name)):
+                raise InputError(
+                    f"features must be {MIND}, a file of a program, or several with their weights, got {shown(name)}"
+                )
+        if self.sources and self.sources.keys() <= {INTENSITIES}:
+            raise InputError("features: intensities alone are what is compared without it; leave it out, or add others")
+        asked = similarity_weights(self.similarity.measure)
+        if self.only_features and any(MEASURES[name].compares_features for name in asked):
+            raise InputError(
+                "similarity: mind makes features of its own; compare others by ssd, lncc or ncc, or say features: mind"
+            )
+
+    @property
+    def sources(self) -> dict[str | Path | Callable[..., Any], float]:
+        """The features that are asked for, with their weights."""
+        if self.features is None:
+            return {}
+        return weights_of(self.features if isinstance(self.features, Mapping) else {self.features: 1.0}, "features")
+
+    @property
+    def programs(self) -> tuple[str | Path, ...]:
+        """The files of programs that make features."""
+        return tuple(s for s in self.sources if isinstance(s, str | Path) and s not in (INTENSITIES, MIND, FILES))
+
+    def with_programs(self, place: Callable[[str], Path]) -> "RegistrationSettings":
+        """Return the same with files of programs where ``place`` says that they are."""
+        there: dict[Any, str] = {name: str(place(str(name))) for name in self.programs}
+        several = isinstance(self.features, Mapping)
+        weights = {there.get(source, source): weight for source, weight in self.sources.items()}
+        return replace(self, features=weights if several else next(iter(weights))) if there else self
+
+    @property
+    def only_features(self) -> bool:
+        """Whether features take the place of the intensities."""
+        return bool(self.sources) and INTENSITIES not in self.sources
+
+    @property
+    def seen_by(self) -> str | Mapping[str, float]:
+        """The measure of the intensities, also where features take their place: what alignments and marks go by."""
+        return "lncc" if self.only_features else self.similarity.measure
 
     @property
     def knows_tissue(self) -> bool:
@@ -306,6 +368,7 @@ class RegistrationSettings:
 
     def decided(self, measure: str = "lncc") -> "RegistrationSettings":
         """Return the same with this measure in place of ``auto``, and with the start that goes with it."""
+        measure = "ssd" if self.only_features else measure
         similarity = self.similarity
         similarity = replace(similarity, measure=measure) if similarity.measure == AUTO else similarity
         chosen = replace(self, similarity=similarity)

@@ -21,7 +21,14 @@ from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity, weighted
 from torchdeform.registration.landmarks import ForwardLandmarks
-from torchdeform.registration.optimise import Coupling, Objective, forward_objective, held_still, optimise_levels
+from torchdeform.registration.optimise import (
+    Coupling,
+    Objective,
+    SimilarityTerm,
+    forward_objective,
+    held_still,
+    optimise_levels,
+)
 from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.result import Callback, LevelRecord
 from torchdeform.registration.settings import RegistrationSettings
@@ -90,6 +97,9 @@ def _by_sides(problem: RegistrationProblem, sides: Tensor) -> RegistrationProble
         fixed_mask=weighted(masks, repeated(problem.fixed_mask)),
         tissue=tissue,
         sides=sides,
+        channels=tuple(
+            replace(one, fixed=repeated(one.fixed), moving=repeated(one.moving)) for one in problem.channels
+        ),
         **{name: repeated(getattr(problem, name)) for name in names},
     )
 
@@ -99,10 +109,14 @@ def _objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationS
     alone = forward_objective(problem, grid, settings)
     sides = restrict(_given(problem.sides), problem.grid, grid)
     count = sides.shape[1]
-    size = alone.similarity.fixed_mask.flatten(1).mean(1)
-    similarity = _OfAllSides(alone.similarity.similarity, size.unflatten(0, (count, -1)))
-    term = replace(alone.similarity, similarity=similarity)
-    return Objective(term, alone.landmarks and _landmarks(problem, grid), Gliding(sides, grid, problem.held))
+
+    def joint(term: SimilarityTerm) -> SimilarityTerm:
+        sizes = _given(term.fixed_mask).flatten(1).mean(1).unflatten(0, (count, -1))
+        return replace(term, similarity=_OfAllSides(term.similarity, sizes))
+
+    more = tuple(replace(one, similarity=joint(one.similarity)) for one in alone.more)
+    points = alone.landmarks and _landmarks(problem, grid)
+    return Objective(joint(alone.similarity), points, Gliding(sides, grid, problem.held), more)
 
 
 def _landmarks(problem: RegistrationProblem, grid: Grid) -> ForwardLandmarks | None:

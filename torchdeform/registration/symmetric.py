@@ -19,12 +19,19 @@ from torchdeform.core.transform import Affine
 from torchdeform.core.warp import compose, invert, sample
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity
-from torchdeform.metrics.similarity import features, make_similarity
+from torchdeform.metrics.similarity import make_similarity
 from torchdeform.registration.landmarks import MidspaceLandmarks, of_other_map
-from torchdeform.registration.optimise import Coupling, Objective, SimilarityTerm, optimise_levels
-from torchdeform.registration.problem import PlacedImage, RegistrationProblem, resample_pair
+from torchdeform.registration.optimise import (
+    Coupling,
+    Objective,
+    SimilarityTerm,
+    additions,
+    compared,
+    optimise_levels,
+)
+from torchdeform.registration.problem import Channels, PlacedImage, RegistrationProblem, resample_pair
 from torchdeform.registration.result import Callback, LevelRecord
-from torchdeform.registration.settings import RegistrationSettings, SimilaritySettings
+from torchdeform.registration.settings import RegistrationSettings
 
 Direction = tuple[tuple[float, ...], ...]
 
@@ -98,15 +105,21 @@ def _of_pairs(record: LevelRecord, items: int) -> LevelRecord:
 
 def symmetric_objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationSettings) -> Objective:
     """Return what is maximised where both images are warped into a space between, the maps being on ``grid``."""
-    measure = settings.similarity.measure
-    images = torch.cat([features(measure, image) for image in (problem.fixed, problem.moving)])
-    masks = None
-    if problem.fixed_mask is not None or problem.moving_mask is not None:
-        ones = torch.ones_like(problem.fixed[:, :1])
-        masks = torch.cat([ones if mask is None else mask for mask in (problem.fixed_mask, problem.moving_mask)])
-    term = SimilarityTerm(problem.grid, images, _MutualSimilarity(settings.similarity, problem.grid), masks)
+    channels = compared(problem, settings)
+    first, *others = [_mutual_term(problem, one, settings) for one in channels]
     pairs = problem.pairs if settings.points_weight > 0 else None
-    return Objective(term, pairs and MidspaceLandmarks(*pairs, grid), _Opposed())
+    more = additions(others, channels[1:], grid)
+    return Objective(first, pairs and MidspaceLandmarks(*pairs, grid), _Opposed(), more)
+
+
+def _mutual_term(problem: RegistrationProblem, channels: Channels, settings: RegistrationSettings) -> SimilarityTerm:
+    """Return the similarity of channels of both images, both warped."""
+    masks, given = None, problem.masks_on(channels.grid)
+    if any(mask is not None for mask in given):
+        ones = torch.ones_like(channels.fixed[:, :1])
+        masks = torch.cat([ones if mask is None else mask for mask in given])
+    similarity = _MutualSimilarity(channels, settings.similarity.window)
+    return SimilarityTerm(channels.grid, torch.cat([channels.fixed, channels.moving]), similarity, masks)
 
 
 class _Opposed(Coupling):
@@ -127,12 +140,12 @@ class _MutualSimilarity(Similarity):
     places, except the places.
     """
 
-    def __init__(self, settings: SimilaritySettings, grid: Grid) -> None:
-        self.settings, self.grid = settings, grid
+    def __init__(self, channels: Channels, window: int) -> None:
+        self.measure, self.grid, self.window = channels.measure, channels.grid, window
 
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         others = of_other_map(warped)
-        similarity = make_similarity(self.settings.measure, others, self.settings.window, grid=self.grid)
+        similarity = make_similarity(self.measure, others, self.window, grid=self.grid)
         value, slope = similarity.evaluate(warped, None if mask is None else mask * of_other_map(mask))
         return (value + of_other_map(value)) / 2, slope
 

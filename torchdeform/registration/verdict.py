@@ -75,6 +75,9 @@ class Verdict:
     findings: tuple[Finding, ...]
 
 
+# Said of labels that were in the cost.
+_PULLED = ", no independent measure, as the labels were in the cost"
+
 _HEADLINES = {
     GOOD: "The images fit, and the map does not fold.",
     LOOK: "Look closely before you use this: {}.",
@@ -92,6 +95,7 @@ def judge(
     warnings: Sequence[str] = (),
     unit: str = "px",
     tissue: Sequence[TissueOutcome] = (),
+    labels_pulled: bool = False,
 ) -> Verdict:
     """Return the verdict on one pair.
 
@@ -104,13 +108,19 @@ def judge(
         warnings: sentences about what looks wrong with the input.
         unit: what lengths are shown in, one of `UNITS`.
         tissue: how labels of tissue were kept, of one item.
+        labels_pulled: whether the labels were in the cost, and so prove nothing.
 
     Notes:
         No figure proves that the right tissue is on the right tissue. Only labels, landmarks or a look can show it.
     """
-    known = list(_annotations(evaluation, evidence, grid, unit))
+    known = list(_annotations(evaluation, evidence, grid, unit, _PULLED if labels_pulled else ""))
     found = [*_folds(folds), *_images(evidence, grid.dim, mirror), *_map(evidence)]
-    if evaluation is not None and _proven(evaluation) and all(some.kind == GOOD for some in known):
+    if (
+        evaluation is not None
+        and not labels_pulled
+        and _proven(evaluation)
+        and all(some.kind == GOOD for some in known)
+    ):
         found = [replace_bad(some) if some.kind == BAD and folds == 0 else some for some in found]
     others = [text for text in warnings if mirror <= _MIRROR or "mirror image" not in text]
     found += [*known, *_tissue(tissue), *(Finding(LOOK, f"{WARNED}{text}.") for text in others)]
@@ -226,12 +236,14 @@ def _tissue(outcomes: Sequence[TissueOutcome]) -> Iterator[Finding]:
             yield Finding(LOOK, text, {"label": one.label, "off": off})
 
 
-def _annotations(evaluation: Evaluation | None, evidence: Evidence, grid: Grid, unit: str) -> Iterator[Finding]:
+def _annotations(
+    evaluation: Evaluation | None, evidence: Evidence, grid: Grid, unit: str, remark: str
+) -> Iterator[Finding]:
     if evaluation is None:
         return
     if evaluation.after.labels:
         yield from _own_images(evidence.label_contrast)
-        yield from _labels(evaluation)
+        yield from _labels(evaluation, remark)
         yield from _left_behind(evaluation, evidence)
         yield from _surfaces(evaluation, grid, unit)
     distances = [stage.distances for stage in (evaluation.before, evaluation.after)]
@@ -257,11 +269,11 @@ def _own_images(contrast: tuple[float, float] | None) -> Iterator[Finding]:
         yield Finding(BAD, text, {"fixed": contrast[0], "moving": contrast[1]})
 
 
-def _labels(evaluation: Evaluation) -> Iterator[Finding]:
+def _labels(evaluation: Evaluation, remark: str) -> Iterator[Finding]:
     """How the overlap of labels changed, on average and of each."""
     before, after = (_mean(stage.dice) for stage in (evaluation.before, evaluation.after))
     figures = {"dice_before": before, "dice_after": after}
-    means = f"mean Dice {number(before)} → {number(after)}"
+    means = f"mean Dice {number(before)} → {number(after)}{remark}"
     if not math.isfinite(after):
         return
     if after < _APART:

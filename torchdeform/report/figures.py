@@ -115,7 +115,7 @@ def _headlines(data: ReportData, most: int) -> tuple[str, str]:
     names = [shortened(Path(image.name).name, most // 2 - 3) for image in (data.moving, data.fixed)]
     return " onto ".join(names), "     ".join(
         (
-            f"{measure_name(result.settings.similarity.measure)} {before:.3g} → {after:.3g}",
+            f"{measure_name(result.settings.seen_by)} {before:.3g} → {after:.3g}",
             f"folds {int(diagnosis.folds.item())}",
             f"determinant {diagnosis.det_min.item():.2g} to {diagnosis.det_max.item():.2g}",
             f"inverse consistency {result.inverse_error_mean.item():.2g} {voxel}",

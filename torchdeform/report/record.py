@@ -5,7 +5,7 @@ import math
 import platform
 import shlex
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from torchdeform.core.diagnostics import Diagnosis
 from torchdeform.core.image import Image
 from torchdeform.core.interpolation import LABEL_MODE
 from torchdeform.metrics.evaluation import Evaluation, Measures
+from torchdeform.registration.channels import described
 from torchdeform.registration.result import LevelRecord, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.tissue import TissueOutcome
@@ -37,7 +38,7 @@ def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[st
         "unit": fixed.unit,
         "fixed": _place(fixed),
         "moving": _place(moving),
-        "similarity": result.settings.similarity.measure,
+        "similarity": result.settings.seen_by,
         "similarity_before": result.similarity_before.item(),
         "similarity_aligned": None if result.similarity_aligned is None else result.similarity_aligned.item(),
         "similarity_after": result.similarity_after.item(),
@@ -58,7 +59,8 @@ def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[st
         "warnings": result.warnings,
         "levels": [_level(level) for level in result.levels],
         "device": device_name(result.displacement.device),
-        "settings": asdict(result.settings),
+        "labels_in_cost": result.settings.labels_weight > 0,
+        "settings": asdict(replace(result.settings, features=described(result.settings.features))),
         "versions": versions(),
     }
 

@@ -100,7 +100,7 @@ def _accuracy(record: Record) -> list[Tile]:
     """Return tiles of labels and landmarks, if they were given."""
     found = []
     for key, name, unit, about in (
-        ("dice_mean", "Dice of the labels", "", "mean overlap before → after; 1 is perfect"),
+        ("dice_mean", "Dice of the labels", "", f"mean overlap before → after; 1 is perfect{_in_cost(record)}"),
         ("landmark_error_mean", "Distance of landmarks", f" {record['unit']}", "mean before → after; 0 is perfect"),
     ):
         before, after = ends(record, key)
@@ -197,9 +197,14 @@ def _labels(record: Record) -> Table | None:
     head = ["label", *(f"Dice {stage}" for stage in stages), "distance before", "distance after"]
     summary = (
         f"Mean Dice {means}, over {len(after)} labels; the worst come first. Distance: 95 % Hausdorff, in "
-        f"{record['unit']}."
+        f"{record['unit']}{_in_cost(record)}."
     )
     return Table("Labels", [_foldable(head, rows, f"All {len(rows)} labels")], summary)
+
+
+def _in_cost(record: Record) -> str:
+    """Return what to say of labels that were in the cost."""
+    return "; the labels were in the cost, so this is no independent measure" if record.get("labels_in_cost") else ""
 
 
 def _landmarks(record: Record) -> Table | None:
