@@ -286,7 +286,7 @@ def _optimise(
         values = before, after
         if problem.tissue is not None:
             u, kept = problem.tissue.corrected(u, problem.grid, settings.folds.min_determinant, problem.held)
-            values = tuple(objective.on_common_voxels([zero, u], [zero, u]))
+            values = tuple(objective.on_common_voxels([zero, u], None))
         known = settings.similarity.measure == "lncc" and not problem.channels
         marks = values if known else _marks(problem, settings, zero, u)
     return _Optimised(u, records, values, marks, perf_counter() - began, kept)
