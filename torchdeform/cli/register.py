@@ -139,6 +139,7 @@ def summary(outcome: Outcome) -> str:
     lines = {
         f"similarity ({measure_name(r['similarity'])})": f"{' -> '.join(marks)} (1: the same)",
         **({} if r["similarity_choice"] is None else {"chosen": r["similarity_choice"]}),
+        **{"keypoints": f"{k['matched']} of {k['looked_for']} found again" for k in r["keypoints"]},
         "folds": folds_text(r),
         "inverse consistency": inverse_text(r["inverse_error_mean"], r["inverse_error_max"]),
         **_measured(r),
