@@ -153,11 +153,11 @@ def common_shift(fixed: Tensor, moving: Tensor, grid: Grid, **given: Any) -> Ten
         fixed: image that stays ``(1, C, *S)``.
         moving: the moving image.
         grid: their grid.
-        given: as for `match_keypoints`; the coarsest level is searched.
+        given: as for `match_keypoints`; a quarter of the points will do.
     """
     settings = given.pop("settings")
-    coarse = replace(settings, levels=settings.levels[:1], reach=settings.reach[:1])
-    points = match_keypoints(fixed, moving, grid, **given, settings=coarse)
+    some = replace(settings, count=max(FEWEST, settings.count // 4))
+    points = match_keypoints(fixed, moving, grid, **given, settings=some)
     if not points.enough:
         return None
     shift = (points.moving - points.fixed).median(dim=1).values
