@@ -38,6 +38,12 @@ FEWEST = 8
 # Corners weaker than this share of the strongest are noise; what is as flat as that, squared, has none.
 _WEAKEST, _FLAT = 1e-5, 1e-12
 
+# A level that is searched has so many nodes along its longest axis.
+_LONGEST = 32
+
+# Nothing is looked for farther away than a side of the box divided by this.
+_SIDE = 3
+
 # An image is moved as a whole where its points have moved by more voxels than this.
 _FAR = 8.0
 
@@ -174,7 +180,7 @@ def match_keypoints(
     settings: KeypointSettings,
 ) -> Keypoints:
     """Return the pairs of one item on which both directions and the neighbours agree; as `keypoint_start`."""
-    finest = pyramid_grids(grid, settings.levels[-1] + 1)[0]
+    finest = _grid_of(grid, settings.levels[-1])
     seen = restrict(fixed, grid, finest)
     points = corners(seen, finest, settings.count, None if mask is None else hat_average(mask, finest))
     if points.shape[1] < FEWEST:
@@ -188,6 +194,11 @@ def match_keypoints(
     if moving_mask is not None:
         kept &= sample(moving_mask, matches.unsqueeze(0), grid)[0, 0] > 0.5
     return Keypoints(points, matches, points.shape[1]).where(kept)
+
+
+def _grid_of(grid: Grid, level: int) -> Grid:
+    """Return the grid of a level, of a finer one where it would have too few nodes."""
+    return next(g for g in pyramid_grids(grid, level + 1) if g == grid or max(g.shape) >= _LONGEST)
 
 
 def distinctiveness(image: Tensor, grid: Grid, sigma: float = 1.0) -> Tensor:
@@ -242,14 +253,14 @@ def _matched(images: Sequence[Tensor], grid: Grid, points: Tensor, settings: Key
     """Return the motion d of points ``(D, n)`` of the first image to the second, and that of their neighbours s."""
     graph = _Graph.of(points, settings.neighbours)
     d = s = torch.zeros_like(points)
-    source = pyramid_grids(grid, settings.levels[-1] + 1)[0]
+    source = _grid_of(grid, settings.levels[-1])
     for level, reach in zip(settings.levels, settings.reach, strict=True):
-        features = pyramid_grids(grid, level + 1)[0]
+        features = _grid_of(grid, level)
         h = _spacing(features, points)
         first, second = (features_of(image, grid, source, features) for image in images)
         nodes, centres = (_nearest(p, features) for p in (points, points + s))
         steps = [max(1, round(reach * min(grid.spacing) / side)) for side in features.spacing]
-        steps = tuple(min(step, n - 1) for step, n in zip(steps, features.shape, strict=True))
+        steps = tuple(min(step, max(1, (n - 1) // _SIDE)) for step, n in zip(steps, features.shape, strict=True))
         cost = _costs(first, second, nodes, centres, steps)
         before = (centres - nodes).to(points)  # where the search begins, in steps
         agree = _agreement(graph, before)
@@ -356,7 +367,7 @@ def map_of(points: Keypoints, grid: Grid, settings: KeypointSettings) -> tuple[T
     """
     if not points.enough:
         return points.fixed.new_zeros(1, grid.dim, *grid.shape), points.where(torch.zeros(points.count).bool())
-    coarse = with_nodes(pyramid_grids(grid, settings.levels[-1] + 1)[0], _NODES)
+    coarse = with_nodes(_grid_of(grid, settings.levels[-1]), _NODES)
     metric = _metric(points, coarse, settings)
     u = points.fixed.new_zeros(1, grid.dim, *coarse.shape)
     for number in range(_ROUNDS):
