@@ -35,7 +35,7 @@ from torchdeform.solvers.cg import conjugate_gradient
 # Fewer pairs than this say nothing about a map.
 FEWEST = 8
 
-# Corners weaker than this share of the strongest are noise; what is as flat as that, squared, has none.
+# Corners weaker than this share of the strongest edge are noise; what is flat, by the square of that, has none.
 _WEAKEST, _FLAT = 1e-5, 1e-12
 
 # A level that is searched has so many nodes along its longest axis.
@@ -53,11 +53,11 @@ _HEARD = 8
 # What a slope of the motion costs against a mean, in the plane that is fitted to the neighbours.
 _RIDGE = 0.1
 
-# Nodes of the grid on which the map is fitted, rounds of it, and how it is integrated. The pairs are met to this share
-# of their own weight in each, and those that are still apart after so many rounds do not fit the others.
+# Nodes of the grid on which the map is fitted, rounds of it, and how it is integrated. In the first rounds a pair weighs
+# little against the others (the first slack λ), and those that are still apart then are left out.
 _NODES, _ROUNDS, _TRUST = 2**16, 6, 3
 _FLOW = OdeSolver(method="midpoint", steps=8)
-_SLACK, _TOLERANCE, _STEPS = 0.05, 0.05, 60
+_SLACK, _TOLERANCE, _STEPS = (0.5, 0.05), 0.05, 60
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ def _grid_of(grid: Grid, level: int) -> Grid:
 
 
 def distinctiveness(image: Tensor, grid: Grid, sigma: float = 1.0) -> Tensor:
-    """Return 1 / tr A⁻¹ ``(B, 1, *S)``, A = G ∗ Σ_c ∇I_c ∇I_cᵀ in voxels: large where no direction is without change.
+    """Return 1 / tr A⁻¹ ``(B, 1, *S)``, A = G ∗ Σ_c ∇I_c ∇I_cᵀ over its largest entry: large where all directions vary.
 
     Args:
         image: ``(B, C, *S)``.
@@ -217,7 +217,7 @@ def distinctiveness(image: Tensor, grid: Grid, sigma: float = 1.0) -> Tensor:
     scale = per_item(largest(tensor).clamp(min=torch.finfo(image.dtype).tiny), tensor)
     tensor = tensor / scale
     minors = torch.stack([cofactors(tensor)[:, a, a] for a in range(grid.dim)]).sum(0).unsqueeze(1)
-    return (determinant(tensor) / minors.clamp(min=_FLAT)).clamp(min=0) * scale[..., 0]
+    return (determinant(tensor) / minors.clamp(min=_FLAT)).clamp(min=0)
 
 
 def corners(image: Tensor, grid: Grid, count: int, weight: Tensor | None = None) -> Tensor:
@@ -232,7 +232,7 @@ def corners(image: Tensor, grid: Grid, count: int, weight: Tensor | None = None)
     strength = distinctiveness(image, grid)
     strength = strength if weight is None else strength * (weight > 0.5)
     peak = strength == MAX_POOL[grid.dim](strength, 3, stride=1, padding=1)
-    nodes = (peak & (strength > _WEAKEST * strength.max())).flatten().nonzero()[:, 0]
+    nodes = (peak & (strength > _WEAKEST)).flatten().nonzero()[:, 0]
     strongest = strength.flatten()[nodes].argsort(descending=True, stable=True)[:count]
     return _places(nodes[strongest].sort().values, grid).to(image) * _spacing(grid, image)
 
@@ -378,7 +378,7 @@ def map_of(points: Keypoints, grid: Grid, settings: KeypointSettings) -> tuple[T
             points, place, apart = points.where(kept), place[..., kept], apart[..., kept]
             if not points.enough:
                 return map_of(points, grid, settings)
-        u = compose(flow(_joining(place, apart, metric), coarse, _FLOW), u, coarse)
+        u = compose(flow(_joining(place, apart, metric, _SLACK[number >= _TRUST]), coarse, _FLOW), u, coarse)
     u = repair_folds(u, coarse, settings.min_determinant)
     return repair_folds(prolong(u, grid), grid), points
 
@@ -393,8 +393,8 @@ def _metric(points: Keypoints, grid: Grid, settings: KeypointSettings) -> Veloci
     return VelocityMetric.of_weights(grid, weights, SolverSettings(), points.fixed, order=2)
 
 
-def _joining(place: Tensor, apart: Tensor, metric: VelocityMetric) -> Tensor:
-    """Return the velocity v = G c of loads c at points that nearly is what they are apart there."""
+def _joining(place: Tensor, apart: Tensor, metric: VelocityMetric, slack: float) -> Tensor:
+    """Return the velocity v = G c of loads c at points with v + slack c = what they are apart there."""
     grid = metric.grid
 
     def velocity(c: Tensor) -> Tensor:
@@ -405,6 +405,6 @@ def _joining(place: Tensor, apart: Tensor, metric: VelocityMetric) -> Tensor:
     own = float(sample(metric.factor(load, power=metric.order), middle, grid).mean())  # of a point, on itself
 
     def joined(c: Tensor) -> Tensor:
-        return sample(velocity(c), place, grid) / own + _SLACK * c
+        return sample(velocity(c), place, grid) / own + slack * c
 
     return velocity(conjugate_gradient(joined, apart, rtol=_TOLERANCE, max_steps=_STEPS).value) / own
