@@ -19,6 +19,7 @@ from torchdeform.registration.optimise import steps_on
 # LNCC, by dimension; `Measure.time` has the others beside it.
 _PAIR = 1.5
 _PER_NODE_STEP = {2: 2e-7, 3: 3e-7}
+_KEYPOINTS = {2: 1.5, 3: 10.0}  # seconds to find 2000 of them, in images of any size
 _HEADER = 60.0  # seconds that reading a header may take
 
 # Shape and channels of an image; None where its file does not say; a sentence where that cannot be read.
@@ -67,7 +68,7 @@ def _seconds(job: Job, size: Size) -> float | None:
     if not isinstance(size, tuple):
         return None
     (shape, channels), settings = size, job.settings
-    grid, (measures, _, symmetric) = Grid(shape), choices(settings)
+    grid, (measures, start, symmetric) = Grid(shape), choices(settings)
     if job.memory is not None:
         try:
             grid = fitting_grid(grid, job.memory, channels, settings)
@@ -79,7 +80,8 @@ def _seconds(job: Job, size: Size) -> float | None:
     node_steps = sum(math.prod(g.shape) * steps_on(g, n, settings) for g, n in zip(levels, steps, strict=True))
     maps = (2 if symmetric else 1) + len(set(settings.sliding))
     fields = maps * channels * sum(measure.time for measure in measures.values())
-    return _PAIR + fields * _PER_NODE_STEP[grid.dim] * node_steps
+    searched = _KEYPOINTS[grid.dim] if start == "keypoints" else 0.0
+    return _PAIR + searched + fields * _PER_NODE_STEP[grid.dim] * node_steps
 
 
 def measure(jobs: Sequence[Job]) -> list[int]:

@@ -18,8 +18,9 @@ _SHRINK = 0.97  # steps in which the grid that fits is sought, per axis
 # fixed grid, whatever the similarity, by dimension. To these come those of `Measure.memory` per node and channel.
 _PROCESS_BYTES = 4.5e8
 _PER_NODE = {2: 100.0, 3: 80.0}
-# The same of a discrete start, whatever the similarity: per node, and per node and channel. What holds more counts.
-_DISCRETE = {2: (130.0, 75.0), 3: (100.0, 65.0)}
+# The same of a start that is searched for, discrete or keypoints, whatever the similarity: per node, and per node and
+# channel. What holds more counts.
+_SEARCH = {2: (130.0, 75.0), 3: (100.0, 65.0)}
 # And of an assembled matrix while it is made: per entry.
 _PER_ENTRY = 90
 # And of the map of each label that glides: as a share of the first map.
@@ -28,9 +29,9 @@ _PER_SIDE = 0.65
 _FILES = {2: (65.0, 48.0), 3: (80.0, 26.0)}
 
 
-def choices(settings: RegistrationSettings) -> tuple[dict[str, Measure], bool, bool]:
-    """Return what the cost of a registration depends on: its measures, a discrete start or not, symmetric or not."""
-    return measures_in(settings.similarity.measure), settings.starts_discretely, settings.symmetric
+def choices(settings: RegistrationSettings) -> tuple[dict[str, Measure], str, bool]:
+    """Return what the cost of a registration depends on: its measures, its start, symmetric or not."""
+    return measures_in(settings.similarity.measure), settings.decided_start, settings.symmetric
 
 
 def footprint(grid: Grid, channels: int, settings: RegistrationSettings) -> int:
@@ -45,10 +46,10 @@ def footprint(grid: Grid, channels: int, settings: RegistrationSettings) -> int:
         Affine in the number of nodes; coarser levels are smaller by 2^D and do not count. Measured in float32 on a CPU,
         within 25 % from 64³ to 256³ and from 512² to 4096², and rather more than is taken beyond.
     """
-    measures, discrete, symmetric = choices(settings)
+    measures, start, symmetric = choices(settings)
     maps = (2 if symmetric else 1) + _PER_SIDE * len(set(settings.sliding))
     per_channel = sum(measure.memory[grid.dim - 2] for measure in measures.values())
-    rates = [(maps * _PER_NODE[grid.dim], maps * per_channel), *([_DISCRETE[grid.dim]] if discrete else [])]
+    rates = [(maps * _PER_NODE[grid.dim], maps * per_channel), *([] if start == "identity" else [_SEARCH[grid.dim]])]
     return max(_affine(grid, channels, rate) for rate in rates) + _matrix(grid, settings)
 
 

@@ -281,15 +281,14 @@ def _searched(
 ) -> tuple[Tensor | None, tuple[Keypoints, ...]]:
     """Return the map to begin with as the settings say, None for the identity, and the points that it joins."""
     images, points = (problem.fixed, problem.moving, problem.grid), ()
-    if settings.start == "keypoints":
-        begin("searching")
+    if settings.decided_start == "identity":
+        return None, points
+    begin("searching")
+    if settings.decided_start == "keypoints":
         masks = {"mask": problem.fixed_mask, "moving_mask": problem.moving_mask}
         start, points = keypoint_start(*images, **masks, settings=settings.keypoints)
-    elif settings.starts_discretely:
-        begin("searching")
-        start = discrete_start(*images, mask=problem.fixed_mask, settings=settings.discrete)
     else:
-        return None, ()
+        start = discrete_start(*images, mask=problem.fixed_mask, settings=settings.discrete)
     return repair_folds(held_still(start, problem.held), problem.grid) if problem.held else start, points
 
 

@@ -53,8 +53,8 @@ _HEARD = 8
 # What a slope of the motion costs against a mean, in the plane that is fitted to the neighbours.
 _RIDGE = 0.1
 
-# Nodes of the grid on which the map is fitted, rounds of it, and how it is integrated. In the first rounds a pair weighs
-# little against the others (the first slack λ), and those that are still apart then are left out.
+# Nodes of the grid on which the map is fitted, rounds of it, and how it is integrated. In the first rounds a pair has
+# little weight against the others (the first slack λ), and those that are still apart then are left out.
 _NODES, _ROUNDS, _TRUST = 2**16, 6, 3
 _FLOW = OdeSolver(method="midpoint", steps=8)
 _SLACK, _TOLERANCE, _STEPS = (0.5, 0.05), 0.05, 60
@@ -111,8 +111,8 @@ def keypoint_start(
         settings: `KeypointSettings` with its defaults when None.
 
     Returns:
-        u ``(B, D, *S)`` in units of spacing, the ``start`` of `register`, and the pairs of each item; u is 0 for an item
-        with fewer than 8 of them, as without texture.
+        u ``(B, D, *S)`` in units of spacing, the ``start`` of `register`, and the pairs of each item. Where those are
+        fewer than 8, as without texture, u is 0.
 
     Raises:
         InputError: shapes, or values that are not finite.

@@ -345,14 +345,15 @@ class RegistrationSettings:
         return bool(self.tissues or self.sliding)
 
     @property
-    def starts_discretely(self) -> bool:
-        """Whether the map to begin with is searched for."""
-        return self.start == "discrete" or (self.start == AUTO and self.similarity.measure == "mind")
+    def decided_start(self) -> str:
+        """The map to begin with, which ``auto`` leaves to the measure."""
+        if self.start != AUTO:
+            return self.start
+        return "discrete" if self.similarity.measure == "mind" else "identity"
 
     def decided(self, measure: str = "lncc") -> "RegistrationSettings":
         """Return the same with this measure in place of ``auto``, and with the start that goes with it."""
         similarity = self.similarity
         similarity = replace(similarity, measure=measure) if similarity.measure == AUTO else similarity
         chosen = replace(self, similarity=similarity)
-        searched = "discrete" if chosen.starts_discretely else "identity"
-        return replace(chosen, start=searched if self.start == AUTO else self.start)
+        return replace(chosen, start=chosen.decided_start)
