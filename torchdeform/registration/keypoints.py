@@ -84,8 +84,8 @@ class Keypoints:
         """Whether they say anything about a map."""
         return self.count >= FEWEST
 
-    def where(self, kept: Tensor) -> "Keypoints":
-        """Return the pairs that are kept ``(n,)``."""
+    def where(self, kept: Tensor | slice) -> "Keypoints":
+        """Return the pairs that are kept, flags ``(n,)`` or a slice."""
         return Keypoints(self.fixed[:, kept], self.moving[:, kept], self.looked_for)
 
 
@@ -184,7 +184,7 @@ def match_keypoints(
     seen = restrict(fixed, grid, finest)
     points = corners(seen, finest, settings.count, None if mask is None else hat_average(mask, finest))
     if points.shape[1] < FEWEST:
-        return Keypoints(points[:, :0], points[:, :0], points.shape[1])
+        return Keypoints(points, points, points.shape[1]).where(slice(0))
     images = (fixed, moving)
     d, s = _matched(images, grid, points, settings)
     matches = _inside(points + d, grid)
@@ -344,7 +344,7 @@ class _Graph:
         away = (places[nearest] - places.unsqueeze(1)) / sigma.view(-1, 1, 1)
         design = torch.cat([torch.ones_like(away[..., :1]), away], dim=2)
         normal = torch.einsum("nm,nma,nmb->nab", gain, design, design)
-        ridge = normal[:, :1, :1] * torch.diag(torch.tensor([0.0, *[_RIDGE] * len(points)]).to(points))
+        ridge = normal[:, :1, :1] * torch.diag(points.new_tensor([0.0, *[_RIDGE] * len(points)]))
         unit = torch.eye(len(points) + 1, dtype=points.dtype, device=points.device)[:, :1]
         weights = torch.linalg.solve(normal + ridge, unit.expand(count, -1, -1))
         return cls(nearest, (design @ weights)[..., 0] * gain)
@@ -366,7 +366,7 @@ def map_of(points: Keypoints, grid: Grid, settings: KeypointSettings) -> tuple[T
         u, which is 0 with fewer than 8 pairs, and the pairs without those that none of its rounds brings together.
     """
     if not points.enough:
-        return points.fixed.new_zeros(1, grid.dim, *grid.shape), points.where(torch.zeros(points.count).bool())
+        return points.fixed.new_zeros(1, grid.dim, *grid.shape), points.where(slice(0))
     coarse = with_nodes(_grid_of(grid, settings.levels[-1]), _NODES)
     metric = _metric(points, coarse, settings)
     u = points.fixed.new_zeros(1, grid.dim, *coarse.shape)
