@@ -52,10 +52,12 @@ from .registration.affine.settings import AlignmentSettings
 from .registration.deformable import register
 from .registration.discrete import discrete_start
 from .registration.evidence import Evidence
+from .registration.keypoints import Keypoints, keypoint_start
 from .registration.problem import Annotations
 from .registration.result import RegistrationResult
 from .registration.settings import (
     DiscreteSettings,
+    KeypointSettings,
     RegistrationSettings,
 )
 from .registration.template import AveragingSettings, Template, build_template
@@ -69,15 +71,16 @@ __version__: str
 __all__ = [
     "Affine", "Alignment", "AlignmentSettings", "Annotations", "AveragingSettings", "ComputationError",
     "DeformationSettings", "Diagnosis", "DiscreteSettings", "Displacement", "Evaluation", "Evidence", "Finding",
-    "Grid", "Image", "InputError", "Measures", "MonitorSettings", "NewtonSettings", "OdeSolver",
-    "RegistrationResult", "RegistrationSettings", "Solution", "SolverSettings", "Status", "Template", "TissueFit",
-    "TissueOutcome", "TorchdeformError", "Transform", "Verdict", "Weights", "align", "average_maps", "ball_monitor",
-    "box_monitor", "build_template", "compose", "curl", "curvature_monitor", "density_monitor", "diagnose", "dice",
-    "discrete_start", "divergence", "find_velocity", "from_jacobian_and_curl", "gradient_monitor",
-    "grid_from_initial_monitor", "grid_from_target_monitor", "hausdorff", "hold_rigid", "hold_volume", "integrate",
-    "invert", "jacobian_determinant", "label_fit", "label_monitor", "line_monitor", "load_settings",
-    "monitor_misfit", "normalise_monitor", "read_image", "read_labels", "read_points", "read_transform",
-    "reconstruct", "register", "ring_monitor", "simulate_volume_change", "solve_div_curl", "track_moving_monitor",
-    "warp", "write_image", "write_labels", "write_points", "write_transform",
+    "Grid", "Image", "InputError", "KeypointSettings", "Keypoints", "Measures", "MonitorSettings", "NewtonSettings",
+    "OdeSolver", "RegistrationResult", "RegistrationSettings", "Solution", "SolverSettings", "Status", "Template",
+    "TissueFit", "TissueOutcome", "TorchdeformError", "Transform", "Verdict", "Weights", "align", "average_maps",
+    "ball_monitor", "box_monitor", "build_template", "compose", "curl", "curvature_monitor", "density_monitor",
+    "diagnose", "dice", "discrete_start", "divergence", "find_velocity", "from_jacobian_and_curl",
+    "gradient_monitor", "grid_from_initial_monitor", "grid_from_target_monitor", "hausdorff", "hold_rigid",
+    "hold_volume", "integrate", "invert", "jacobian_determinant", "keypoint_start", "label_fit", "label_monitor",
+    "line_monitor", "load_settings", "monitor_misfit", "normalise_monitor", "read_image", "read_labels",
+    "read_points", "read_transform", "reconstruct", "register", "ring_monitor", "simulate_volume_change",
+    "solve_div_curl", "track_moving_monitor", "warp", "write_image", "write_labels", "write_points",
+    "write_transform",
 ]
 # fmt: on

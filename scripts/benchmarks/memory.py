@@ -32,6 +32,7 @@ CASES = (
     *((3, n, 1, "similarity=lncc", "start=discrete") for n in (64, 128)),
     (3, 96, 1, "similarity=ssd", "start=discrete"),
     (3, 96, 3, "similarity=lncc", "start=discrete"),
+    *((d, n, 1, "similarity=ssd", "start=keypoints") for d, n in ((2, 1024), (3, 64), (3, 128))),
     *((2, n, 1, "similarity=lncc", "symmetric=true") for n in (512, 1024, 2048)),
     *((3, n, 1, "similarity=lncc", "symmetric=true") for n in (64, 96, 128, 160)),
     *((3, 96, 1, f"similarity={s}", "symmetric=true") for s in ("ssd", "mi", "ngf", "mind")),

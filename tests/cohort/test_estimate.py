@@ -46,6 +46,8 @@ def test_costs_grow_with_size_steps_and_number(tmp_path):
     assert one.seconds < two.seconds < both.seconds == pytest.approx(one.seconds + two.seconds)
     assert one.memory < two.memory == both.memory
     assert estimate([slow]).seconds > one.seconds
+    searched = _job(tmp_path, (32, 32), settings={"start": "keypoints"})
+    assert estimate([searched]).seconds > one.seconds
     assert estimate([_job(tmp_path, (32, 32), settings={"sliding": [1, 2]})]).seconds > estimate([slow]).seconds
     assert estimate([tight]).seconds < two.seconds
     assert estimate([tight]).memory <= 480_000_000

@@ -33,8 +33,8 @@ def test_every_entry_is_cited_by_some_settings():
     assert set(citations(settings_of(features="mind", similarity="ssd"))) - set(
         citations(settings_of(similarity="ssd"))
     ) == {"heinrich2013towards"}
-    several = settings_of(similarity=dict.fromkeys(MEASURES, 1.0), start="discrete")
-    assert set(citations(several)) == set(bibliography())
+    several = [settings_of(similarity=dict.fromkeys(MEASURES, 1.0), start=start) for start in ("discrete", "keypoints")]
+    assert set().union(*map(citations, several)) == set(bibliography())
 
 
 @pytest.mark.parametrize(
@@ -47,6 +47,10 @@ def test_every_entry_is_cited_by_some_settings():
         (
             {"similarity": "mind", "start": "discrete"},
             {"heinrich2013towards", "steinbruecker2009large", "siebert2021fast"},
+        ),
+        (
+            {"similarity": "ssd", "start": "keypoints"},
+            {"foerstner1987fast", "heinrich2015estimating", "steinbruecker2009large", "heinrich2013towards"},
         ),
     ],
 )

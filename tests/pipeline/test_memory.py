@@ -137,7 +137,7 @@ def test_what_reading_and_writing_take_is_the_least():
     shape=st.lists(st.integers(8, 700), min_size=2, max_size=3),
     channels=st.integers(1, 4),
     symmetric=st.booleans(),
-    start=st.sampled_from(["identity", "discrete"]),
+    start=st.sampled_from(["identity", "discrete", "keypoints"]),
     similarity=st.sampled_from(sorted(MEASURES)),
     solver=st.sampled_from(["auto", "assembled"]),
     limit=st.integers(1, 2 * 10**9),

@@ -75,6 +75,7 @@ def _calls(grid: td.Grid) -> dict[str, Callable[[], Tensor]]:
         "symmetric": lambda: td.register(fixed, moving, replace(QUICK, symmetric=True)).displacement,
         "align": lambda: _affine(td.align(*images, "affine")),
         "discrete": lambda: td.discrete_start(fixed, moving, grid, settings=NEAR),
+        "keypoints": lambda: td.keypoint_start(fixed, moving, grid)[0],
         "template": lambda: td.build_template(images, QUICK, rounds=1).image.data,
         "version 1": lambda: td.grid_from_initial_monitor(fixed, grid),
         "version 2": lambda: td.grid_from_target_monitor(fixed, grid, moving),

@@ -189,7 +189,7 @@ def test_searches_that_are_too_wide_are_refused():
         ({"coupling": ()}, "at least one price"),
         ({"coupling": (0.1, -1.0)}, "coupling must be positive"),
         ({"length_scale": math.inf}, "length_scale must be positive and finite"),
-        ({"min_determinant": 1.0}, "below 1"),
+        ({"min_determinant": 1.0}, "between 0 and 1"),
     ],
 )
 def test_settings_out_of_range_are_named(change, message):

@@ -145,6 +145,7 @@ def summary(outcome: Outcome) -> str:
     lines = {
         f"similarity ({measure_name(r['similarity'])})": f"{' -> '.join(marks)} (1: the same)",
         **({} if r["similarity_choice"] is None else {"chosen": r["similarity_choice"]}),
+        **_matched(r),
         "folds": folds_text(r),
         "inverse consistency": inverse_text(r["inverse_error_mean"], r["inverse_error_max"]),
         **_measured(r),
@@ -155,6 +156,14 @@ def summary(outcome: Outcome) -> str:
     if REPORT in r["files"]:
         lines["look at"] = str(outcome.folder / REPORT)
     return f"{verdict_text(r['verdict'])}\n{table(lines)}"
+
+
+def _matched(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return how many points the start has found again."""
+    if not record["keypoints"]:
+        return {}
+    found = record["keypoints"][0]
+    return {"points": f"{found['matched']} of {found['looked_for']} found again in the other image"}
 
 
 def verdict_text(verdict: Mapping[str, Any]) -> str:

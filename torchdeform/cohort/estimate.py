@@ -20,6 +20,7 @@ from torchdeform.registration.settings import MIND
 # LNCC, by dimension; `Measure.time` has the others beside it.
 _PAIR = 1.5
 _PER_NODE_STEP = {2: 2e-7, 3: 3e-7}
+_KEYPOINTS = {2: 1.5, 3: 10.0}  # seconds to find 2000 of them, in images of any size
 _HEADER = 60.0  # seconds that reading a header may take
 _FEATURES = 16  # that a program is taken to make, which is not run for an estimate
 
@@ -69,7 +70,7 @@ def _seconds(job: Job, size: Size) -> float | None:
     if not isinstance(size, tuple):
         return None
     settings, (grid, channels) = job.settings, _channels(job, size)
-    measures, _, symmetric = choices(settings)
+    measures, start, symmetric = choices(settings)
     if job.memory is not None:
         try:
             grid = fitting_grid(grid, job.memory, channels, settings)
@@ -82,7 +83,8 @@ def _seconds(job: Job, size: Size) -> float | None:
     maps = (2 if symmetric else 1) + len(set(settings.sliding))
     compared = channels.features if settings.only_features else channels.features + channels.images
     fields = maps * compared * sum(measure.time for measure in measures.values())
-    return _PAIR + fields * _PER_NODE_STEP[grid.dim] * node_steps
+    searched = _KEYPOINTS[grid.dim] if start == "keypoints" else 0.0
+    return _PAIR + searched + fields * _PER_NODE_STEP[grid.dim] * node_steps
 
 
 def measure(jobs: Sequence[Job]) -> list[int]:

@@ -10,7 +10,11 @@ from torchdeform.registration.settings import MIND, RegistrationSettings
 
 # What every registration uses, and what some settings add; the keys are those of references.bib.
 _ALWAYS = {"torchdeform": "the software", "liu2007reconstruction": "the method", "liu2024finite": "what a fold is"}
-_DISCRETE = ("steinbruecker2009large", "siebert2021fast", "heinrich2013towards")
+_STARTS = {
+    "identity": (),
+    "discrete": ("steinbruecker2009large", "siebert2021fast", "heinrich2013towards"),
+    "keypoints": ("foerstner1987fast", "heinrich2015estimating", "steinbruecker2009large", "heinrich2013towards"),
+}
 
 
 def citations(settings: RegistrationSettings) -> dict[str, str]:
@@ -22,12 +26,12 @@ def citations(settings: RegistrationSettings) -> dict[str, str]:
     Notes:
         Measures that are common property (``ssd``, ``ncc``) have no entry.
     """
-    found, (measures, discrete, _) = dict(_ALWAYS), choices(settings)
+    found, (measures, start, _) = dict(_ALWAYS), choices(settings)
     measures = measures | ({"mind": MEASURES["mind"]} if MIND in settings.sources else {})
     for name, measure in measures.items():
         found |= dict.fromkeys(measure.references, f"similarity: {name}")
-    if discrete:
-        found |= {key: f"{found[key]}, start: discrete" if key in found else "start: discrete" for key in _DISCRETE}
+    use = f"start: {start}"
+    found |= {key: f"{found[key]}, {use}" if key in found else use for key in _STARTS[start]}
     return found
 
 

@@ -20,8 +20,9 @@ _SHRINK = 0.97  # steps in which the grid that fits is sought, per axis
 # fixed grid, whatever the similarity, by dimension. To these come those of `Measure.memory` per node and channel.
 _PROCESS_BYTES = 4.5e8
 _PER_NODE = {2: 100.0, 3: 80.0}
-# The same of a discrete start, whatever the similarity: per node, and per node and channel. What holds more counts.
-_DISCRETE = {2: (130.0, 75.0), 3: (100.0, 65.0)}
+# The same of a start that is searched for, discrete or keypoints, whatever the similarity: per node, and per node and
+# channel. What holds more counts.
+_SEARCH = {2: (130.0, 75.0), 3: (100.0, 65.0)}
 # And of an assembled matrix while it is made: per entry.
 _PER_ENTRY = 90
 # And of the map of each label that glides: as a share of the first map.
@@ -42,9 +43,9 @@ class Channels:
     features: int = 0
 
 
-def choices(settings: RegistrationSettings) -> tuple[dict[str, Measure], bool, bool]:
-    """Return what the cost of a registration depends on: its measures, a discrete start or not, symmetric or not."""
-    return measures_in(settings.similarity.measure), settings.starts_discretely, settings.symmetric
+def choices(settings: RegistrationSettings) -> tuple[dict[str, Measure], str, bool]:
+    """Return what the cost of a registration depends on: its measures, its start, symmetric or not."""
+    return measures_in(settings.similarity.measure), settings.decided_start, settings.symmetric
 
 
 def footprint(grid: Grid, channels: int | Channels, settings: RegistrationSettings) -> int:
@@ -59,11 +60,11 @@ def footprint(grid: Grid, channels: int | Channels, settings: RegistrationSettin
         Affine in the number of nodes; coarser levels are smaller by 2^D and do not count. Measured in float32 on a CPU,
         within 25 % from 64³ to 256³ and from 512² to 4096², and rather more than is taken beyond.
     """
-    _, discrete, symmetric = choices(settings)
+    _, start, symmetric = choices(settings)
     maps = (2 if symmetric else 1) + _PER_SIDE * len(set(settings.sliding))
     per_channel = sum(measure.memory[grid.dim - 2] for measure in measures_in(settings.seen_by).values())
     per_node = maps * (_PER_NODE[grid.dim] + _counted(channels).features * _PER_FEATURE[grid.dim])
-    rates = [(per_node, maps * per_channel), *([_DISCRETE[grid.dim]] if discrete else [])]
+    rates = [(per_node, maps * per_channel), *([] if start == "identity" else [_SEARCH[grid.dim]])]
     return max(_affine(grid, channels, rate) for rate in rates) + _matrix(grid, settings) + _labels(grid, settings)
 
 

@@ -23,6 +23,7 @@ from torchdeform.registration.agreement import disagreement
 from torchdeform.registration.channels import count_features, settled, with_channels
 from torchdeform.registration.discrete import discrete_start
 from torchdeform.registration.evidence import gather_evidence, to_compare, with_labels
+from torchdeform.registration.keypoints import Keypoints, keypoint_start, too_few
 from torchdeform.registration.optimise import best_map, common_mask, forward_objective, held_still, optimise_levels
 from torchdeform.registration.placement import Placement, place, problem_at
 from torchdeform.registration.problem import (
@@ -208,7 +209,7 @@ def _register_images(
         result,
         affine=affine,
         alignment=alignment,
-        warnings=alignment.warnings if alignment else (),
+        warnings=(*(alignment.warnings if alignment else ()), *result.warnings),
         unit=fixed.unit,
         absent=moved_with(regions, found.u, fixed.grid),
         choice=placed.choice,
@@ -244,7 +245,7 @@ def _warped(fixed: Image, moving: Image, affine: Affine | None, u: Tensor, setti
 
 @dataclass(frozen=True)
 class _Optimised:
-    """Where the loop ended: the displacement on the fixed grid, how each level went, S and its mark, seconds."""
+    """Where the loop ended: the displacement on the fixed grid, how each level went, S, its mark, seconds ..."""
 
     u: Tensor
     records: tuple[LevelRecord, ...]
@@ -252,6 +253,7 @@ class _Optimised:
     marks: tuple[Tensor, ...]
     seconds: float
     tissue: tuple[TissueOutcome, ...]
+    keypoints: tuple[Keypoints, ...]
 
 
 def _optimise(
@@ -263,15 +265,11 @@ def _optimise(
 ) -> _Optimised:
     """Optimise on the fixed grid or in the space between; the images as they are compared are needed no more then."""
     began = perf_counter()
+    points: tuple[Keypoints, ...] = ()
     if start is not None:
         start = _checked_start(start, problem)
-    elif settings.starts_discretely:
-        begin("searching")
-        start = discrete_start(
-            problem.fixed, problem.moving, problem.grid, mask=problem.fixed_mask, settings=settings.discrete
-        )
-        if problem.held:
-            start = repair_folds(held_still(start, problem.held), problem.grid)
+    else:
+        start, points = _searched(problem, settings)
     if space is not None:
         u, records = optimise_symmetric(space, problem.grid, settings, start, callback)
     elif settings.sliding:
@@ -289,7 +287,23 @@ def _optimise(
             values = tuple(objective.on_common_voxels([zero, u], None))
         known = settings.similarity.measure == "lncc" and not problem.channels
         marks = values if known else _marks(problem, settings, zero, u)
-    return _Optimised(u, records, values, marks, perf_counter() - began, kept)
+    return _Optimised(u, records, values, marks, perf_counter() - began, kept, points)
+
+
+def _searched(
+    problem: RegistrationProblem, settings: RegistrationSettings
+) -> tuple[Tensor | None, tuple[Keypoints, ...]]:
+    """Return the map to begin with as the settings say, None for the identity, and the points that it joins."""
+    images, points = (problem.fixed, problem.moving, problem.grid), ()
+    if settings.decided_start == "identity":
+        return None, points
+    begin("searching")
+    if settings.decided_start == "keypoints":
+        masks = {"mask": problem.fixed_mask, "moving_mask": problem.moving_mask}
+        start, points = keypoint_start(*images, **masks, settings=settings.keypoints)
+    else:
+        start = discrete_start(*images, mask=problem.fixed_mask, settings=settings.discrete)
+    return repair_folds(held_still(start, problem.held), problem.grid) if problem.held else start, points
 
 
 def _marks(problem: RegistrationProblem, settings: RegistrationSettings, *maps: Tensor) -> tuple[Tensor, ...]:
@@ -334,6 +348,8 @@ def _result(found: _Optimised, grid: Grid, warped: Tensor, settings: Registratio
             seconds={"register": found.seconds, "invert": inverted - start, "diagnose": perf_counter() - inverted},
             settings=settings,
             tissue=found.tissue,
+            keypoints=found.keypoints,
+            warnings=too_few(found.keypoints),
         )
 
 

@@ -10,16 +10,23 @@ from torch import Tensor
 from torchdeform.core.flow import OdeSolver, flow
 from torchdeform.core.fold_free import repair_folds
 from torchdeform.core.grid import Grid
-from torchdeform.core.intensities import require_finite
 from torchdeform.core.resampling import hat_average, prolong, pyramid_grids, restrict
 from torchdeform.core.warp import compose, warp
 from torchdeform.errors import InputError
 from torchdeform.fem.solver import SolverSettings
 from torchdeform.fem.weights import Weights
-from torchdeform.metrics.mind import mind_ssc
+from torchdeform.registration.matching import (
+    CHUNK,
+    SMALLEST_SCALE,
+    couple,
+    displacements,
+    features_of,
+    gaussian,
+    items_of,
+    require_pair,
+)
 from torchdeform.registration.settings import DiscreteSettings
 from torchdeform.registration.velocity import VelocityMetric
-from torchdeform.solvers.sine_cosine import inverse_transform, transform
 
 # Rounds in which the two directions are made inverse to each other, and in which a velocity is fitted to matches.
 _ROUNDS = 15
@@ -28,14 +35,10 @@ _FITS = 5
 # How the flow that is fitted is integrated.
 _FLOW = OdeSolver(method="midpoint", steps=6)
 
-# Costs are divided by their standard deviation, which counts as no smaller than this (features lie in [0, 1]).
-_SMALLEST_SCALE = 1e-2
-
 # Control points of smaller weight follow their neighbours.
 _SMALLEST_WEIGHT = 0.01
 
-# Entries of a temporary, and entries of the cost volume at most (2 GiB in float32).
-_CHUNK = 2**22
+# Entries of the cost volume at most (2 GiB in float32).
 _LARGEST_VOLUME = 2**29
 
 
@@ -70,23 +73,10 @@ def discrete_start(
         differentiable. The intensities do not matter, the contrast may differ. Motion within reach that the coarsest
         level of `register` would find by itself gains nothing.
     """
-    _check(fixed, moving, mask, grid)
+    require_pair(fixed, moving, {"mask": mask}, grid, "discrete_start")
     settings = settings or DiscreteSettings()
-    masks = [None] * len(fixed) if mask is None else mask.to(fixed).expand(len(fixed), *mask.shape[1:]).split(1)
-    items = zip(fixed.split(1), moving.split(1), masks, strict=True)
+    items = zip(fixed.split(1), moving.split(1), items_of(mask, fixed), strict=True)
     return torch.cat([_start(*item, grid, settings) for item in items])
-
-
-def _check(fixed: Tensor, moving: Tensor, mask: Tensor | None, grid: Grid) -> None:
-    grid.check(fixed, "discrete_start: fixed")
-    grid.check(moving, "discrete_start: moving", components=fixed.shape[1])
-    if (fixed.shape[0], fixed.dtype, fixed.device) != (moving.shape[0], moving.dtype, moving.device):
-        raise InputError("discrete_start: fixed and moving must agree in batch size, dtype and device")
-    require_finite(fixed, moving, "discrete_start")
-    if mask is not None and (tuple(mask.shape[1:]) != (1, *grid.shape) or len(mask) not in (1, len(fixed))):
-        raise InputError(
-            f"discrete_start: mask must have shape {(len(fixed), 1, *grid.shape)}, got {tuple(mask.shape)}"
-        )
 
 
 def _start(fixed: Tensor, moving: Tensor, mask: Tensor | None, grid: Grid, settings: DiscreteSettings) -> Tensor:
@@ -124,11 +114,6 @@ class _Search:
     reach: tuple[int, ...]
     settings: DiscreteSettings
 
-    def labels(self, like: Tensor) -> Tensor:
-        """Return all displacements ``(L, D)`` in steps."""
-        sides = [torch.arange(-r, r + 1, dtype=like.dtype, device=like.device) for r in self.reach]
-        return torch.cartesian_prod(*sides)
-
 
 def _make_search(grid: Grid, level: int, reach: float, settings: DiscreteSettings) -> _Search:
     source, features = (pyramid_grids(grid, index + 1)[0] for index in (settings.levels[-1], level))
@@ -152,15 +137,15 @@ def _match(search: _Search, fixed: Tensor, moving: Tensor, mask: Tensor | None) 
 
 
 def _features(search: _Search, image: Tensor) -> Tensor:
-    return hat_average(mind_ssc(restrict(image, search.images, search.source)), search.features)
+    return features_of(image, search.images, search.source, search.features)
 
 
 def _cost_volume(fixed: Tensor, moving: Tensor, weight: Tensor, search: _Search) -> Tensor:
     """Return C ``(L, N)`` at the N control points, in standard deviations over the displacements."""
-    labels = search.labels(fixed).long().tolist()
+    labels = displacements(search.reach, fixed).long().tolist()
     padded = F.pad(moving, [r for r in reversed(search.reach) for _ in range(2)], mode="replicate")
     cost, buffer = fixed.new_empty(len(labels), math.prod(search.control.shape)), torch.empty_like(fixed)
-    chunk = max(1, _CHUNK // math.prod(search.features.shape))
+    chunk = max(1, CHUNK // math.prod(search.features.shape))
     for start in range(0, len(labels), chunk):
         part = fixed.new_empty(1, min(chunk, len(labels) - start), *search.features.shape)
         for row, label in zip(part[0], labels[start : start + chunk], strict=True):
@@ -168,7 +153,7 @@ def _cost_volume(fixed: Tensor, moving: Tensor, weight: Tensor, search: _Search)
             torch.sum(buffer.square_()[0], 0, out=row)
         cost[start : start + chunk] = hat_average(part.mul_(weight), search.control)[0].flatten(1)
     scale = cost.std(dim=0).sum() / hat_average(weight, search.control).sum()
-    return cost.div_(scale.clamp(min=_SMALLEST_SCALE))
+    return cost.div_(scale.clamp(min=SMALLEST_SCALE))
 
 
 def _shifted(padded: Tensor, label: list[int], search: _Search) -> Tensor:
@@ -179,32 +164,17 @@ def _shifted(padded: Tensor, label: list[int], search: _Search) -> Tensor:
 
 
 def _couple(cost: Tensor, weight: Tensor, search: _Search) -> Tensor:
-    """Return s of the minimum over d and s of Σ C(x, d) + α |d − s|², s being smooth, for rising α."""
-    labels, settings = search.labels(cost), search.settings
-    total = _smooth(weight, settings.smoothing).clamp(min=_SMALLEST_WEIGHT)
-    s = cost.new_zeros(1, labels.shape[1], *search.control.shape)
-    for price in settings.coupling:
-        d = labels[_cheapest(cost, labels, s.flatten(2)[0], price)].T.reshape(s.shape)
-        s = _smooth(weight * d, settings.smoothing) / total
+    """Return the smooth field that costs least, in units of spacing."""
+    settings, shape = search.settings, (1, -1, *search.control.shape)
+    total = gaussian(weight, settings.smoothing).clamp(min=_SMALLEST_WEIGHT)
+
+    def smoothed(d: Tensor) -> Tensor:
+        return (gaussian(weight * d.reshape(shape), settings.smoothing) / total).flatten(2)[0]
+
+    labels = displacements(search.reach, cost)
+    start = cost.new_zeros(labels.shape[1], cost.shape[1])
+    s = couple(cost, labels, smoothed, settings.coupling, start)[1].reshape(shape)
     return s * search.features.along(search.features.spacing, s)
-
-
-def _cheapest(cost: Tensor, labels: Tensor, s: Tensor, price: float) -> Tensor:
-    """Return at each control point the number of the label d that minimises C + α (|d|² − 2 d·s), ``(N,)``."""
-    left = torch.cat([labels, labels.square().sum(1, keepdim=True)], dim=1)
-    right = torch.cat([-2 * s, torch.ones_like(s[:1])])
-    size = max(1, _CHUNK // len(labels))
-    parts = zip(cost.split(size, dim=1), right.split(size, dim=1), strict=True)
-    return torch.cat([torch.addmm(c, left, r, alpha=price).argmin(0) for c, r in parts])
-
-
-def _smooth(x: Tensor, sigma: float) -> Tensor:
-    """Convolve with a Gaussian of ``sigma`` nodes, x being mirrored at the boundary: cosines are damped."""
-    for axis in range(2, x.dim()):
-        frequency = torch.arange(x.shape[axis], dtype=x.dtype, device=x.device) * (math.pi / (x.shape[axis] - 1))
-        gain = torch.exp(-0.5 * (sigma * frequency) ** 2).view(-1, *([1] * (x.dim() - 1 - axis)))
-        x = transform(inverse_transform(x, axis, "cosine") * gain, axis, "cosine")
-    return x
 
 
 def _agreed(forward: Tensor, backward: Tensor, grid: Grid) -> Tensor:

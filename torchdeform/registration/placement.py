@@ -14,6 +14,7 @@ from torchdeform.metrics.base import weighted
 from torchdeform.metrics.correlation import LNCC_FLOOR, contrast, local_contrast, window_mean, window_moments
 from torchdeform.metrics.similarity import mark
 from torchdeform.registration.affine.align import Alignment, align
+from torchdeform.registration.keypoints import common_shift
 from torchdeform.registration.problem import Annotations, PlacedImage, RegistrationProblem, placed_images, resample_pair
 from torchdeform.registration.settings import RegistrationSettings
 
@@ -69,6 +70,8 @@ def place(
         The alignment is not taken where the files' own place has as much merit: `mark` times the share of the fixed
         image's contrast that is seen, at full detail, in the measure of the registration. Merit counts what the moving
         image does not show as unrelated, so that both places are judged over the same voxels.
+        Without an alignment, ``start: keypoints`` begins with the translation that most of its points share, if they
+        are far away: what it brings into the box cannot be seen, or reached by a map of the box, otherwise.
         Where tissue is to keep its shape or its volume, ``similarity`` and ``affine`` become ``rigid``.
     """
     settings = _keeping_tissue(settings)
@@ -77,6 +80,9 @@ def place(
         alignment = _align(fixed, moving, settings, annotations)
         affine = alignment.affine
     problem = problem_at(*both, affine).scaled(settings)
+    if affine is None and settings.start == "keypoints":
+        affine = _shift(both[0].image, problem, settings)
+        problem = problem if affine is None else problem_at(*both, affine).scaled(settings)
     settings, choice = choose(problem, settings)
     if alignment is None:
         return Placement(settings, affine, choice=choice)
@@ -85,6 +91,17 @@ def place(
         kept = replace(alignment, affine=Affine.identity(fixed.grid.dim), start="geometry")
         alignment = replace(kept, similarity_after=alignment.similarity_before)
     return Placement(settings, alignment.affine, alignment, unaligned, choice)
+
+
+def _shift(fixed: Image, problem: RegistrationProblem, settings: RegistrationSettings) -> Affine | None:
+    """Return the translation of the world by which the points of two images move as a whole, None if not far."""
+    masks = {"mask": problem.fixed_mask, "moving_mask": problem.moving_mask}
+    shift = common_shift(problem.fixed, problem.moving, problem.grid, **masks, settings=settings.keypoints)
+    if shift is None:
+        return None
+    ends = torch.stack([torch.zeros_like(shift), shift], dim=1).double().cpu().unsqueeze(0)
+    start, end = fixed.to_world(ends)[0].unbind(1)
+    return replace(Affine.identity(fixed.grid.dim), offset=end - start)
 
 
 def _keeping_tissue(settings: RegistrationSettings) -> RegistrationSettings:

@@ -12,6 +12,7 @@ from torchdeform.errors import InputError
 from torchdeform.metrics.evaluation import Evaluation
 from torchdeform.registration.affine.align import Alignment
 from torchdeform.registration.evidence import Evidence
+from torchdeform.registration.keypoints import Keypoints
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.tissue import TissueOutcome
 from torchdeform.registration.verdict import Verdict, judge
@@ -89,6 +90,7 @@ class RegistrationResult:
         choice: a sentence on the similarity that was chosen; None where it was given.
         evidence: what the images and the map say, of each item.
         tissue: how the labels of the tissue were kept; empty without.
+        keypoints: the pairs of points that the start joined, of each item; empty where none were looked for.
         warnings: sentences about what looks wrong with the images.
         unit: what lengths are shown in.
     """
@@ -115,6 +117,7 @@ class RegistrationResult:
     choice: str | None = None
     evidence: tuple[Evidence, ...] = ()
     tissue: tuple[TissueOutcome, ...] = ()
+    keypoints: tuple[Keypoints, ...] = ()
     warnings: tuple[str, ...] = ()
     unit: str = "px"
 

@@ -14,7 +14,7 @@ from torchdeform.metrics.similarity import MEASURES, measure_name, similarity_we
 from torchdeform.registration.affine.settings import AlignmentSettings
 
 OFF = "off"
-STARTS = (AUTO, "identity", "discrete")
+STARTS = (AUTO, "identity", "discrete", "keypoints")
 
 # Features that need no program: the images themselves, self-similarities, and channels that come in files.
 INTENSITIES, MIND, FILES = "intensities", "mind", "files"
@@ -27,6 +27,7 @@ TISSUES: dict[str, dict[str, float]] = {
     "incompressible": {"div": 100.0},
 }
 PRICES = ("div", "strain", "curl")
+_MOST_POINTS = 5000  # of which each is compared with every other
 STENCILS = ("auto", "convolution", "shifts")
 
 
@@ -163,6 +164,18 @@ class FoldSettings:
         require_ranges(self, "folds.", soft_determinant="finite, not negative", min_determinant="inside 0 to 1")
 
 
+def _require_search(settings: "DiscreteSettings | KeypointSettings", group: str) -> None:
+    """Raise `InputError`, which names the group, where levels, reach, coupling or the determinant are out of range."""
+    levels, reach = settings.levels, settings.reach
+    if not levels or len(levels) != len(reach):
+        raise InputError(f"{group}levels and {group}reach must have one entry each per level, got {levels}, {reach}")
+    if min(levels) < 0 or list(levels) != sorted(levels, reverse=True):
+        raise InputError(f"{group}levels must not be negative and run from coarse to fine, got {levels}")
+    if not settings.coupling:
+        raise InputError(f"{group}coupling must have at least one price")
+    require_ranges(settings, group, reach="positive", coupling="positive", min_determinant="inside 0 to 1")
+
+
 @dataclass(frozen=True, kw_only=True)
 class DiscreteSettings:
     """How far and how finely `discrete_start` searches, and how smooth its result is.
@@ -194,16 +207,45 @@ class DiscreteSettings:
     min_determinant: float = 0.1
 
     def __post_init__(self) -> None:
-        if not self.levels or len(self.levels) != len(self.reach):
-            both = f"{self.levels}, {self.reach}"
-            raise InputError(f"discrete.levels and discrete.reach must have one entry each per level, got {both}")
-        if min(self.levels) < 0 or list(self.levels) != sorted(self.levels, reverse=True):
-            raise InputError(f"discrete.levels must not be negative and run from coarse to fine, got {self.levels}")
-        if not self.coupling:
-            raise InputError("discrete.coupling must have at least one price")
-        positive = dict.fromkeys(("reach", "coupling", "smoothing", "length_scale", "min_determinant"), "positive")
-        require_ranges(self, "discrete.", spacing="at least 1", **positive)
-        require_ranges(self, "discrete.", min_determinant="below 1")
+        _require_search(self, "discrete.")
+        require_ranges(self, "discrete.", spacing="at least 1", smoothing="positive", length_scale="positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeypointSettings:
+    """How many points `keypoint_start` looks for, how far, and how smooth the map between them is.
+
+    Args:
+        count: corners of the fixed image at most, at least 8; the strongest are taken.
+        levels: pyramid levels to search on, coarse to fine, 0 being the images' own, as `DiscreteSettings`.
+        reach: longest displacement along an axis tried on each of them, in voxels of the images. A later level
+            corrects the ones before.
+        neighbours: with how many of the nearest points each has to agree.
+        coupling: prices of a squared step between a point and its neighbours, in standard deviations of the matching
+            cost; they rise from the first round to the last.
+        agreement: how many voxels a point may be away from where the way back from its match leads, its motion from
+            that of its neighbours, and its match from the map.
+        length_scale: range of the metric in which the map is fitted, in distances to these neighbours.
+        min_determinant: smallest one-sided determinant of the map.
+
+    Raises:
+        InputError: a value out of range, named.
+    """
+
+    count: int = 2000
+    levels: tuple[int, ...] = (2, 1)
+    reach: tuple[float, ...] = (40.0, 6.0)
+    neighbours: int = 4
+    coupling: tuple[float, ...] = (0.003, 0.01, 0.03, 0.1, 0.3)
+    agreement: float = 4.0
+    length_scale: float = 4.0
+    min_determinant: float = 0.1
+
+    def __post_init__(self) -> None:
+        _require_search(self, "keypoints.")
+        most = (lambda n: isinstance(n, int) and 8 <= n <= _MOST_POINTS, f"be a whole number from 8 to {_MOST_POINTS}")
+        few = (lambda n: isinstance(n, int) and 1 <= n <= 64, "be a whole number from 1 to 64")
+        require_ranges(self, "keypoints.", count=most, neighbours=few, agreement="positive", length_scale="positive")
 
 
 Tissue = str | Mapping[str, float]
@@ -224,7 +266,7 @@ def require_tissue(label: int, tissue: Tissue) -> None:
         raise InputError(f"{where}: curl and strain must not both be 0, or it may take any shape")
 
 
-_ALIGN, _DISCRETE = AlignmentSettings(), DiscreteSettings()
+_ALIGN, _DISCRETE, _KEYPOINTS = AlignmentSettings(), DiscreteSettings(), KeypointSettings()
 _SIMILARITY, _METRIC = SimilaritySettings(), MetricSettings()
 _SOLVER, _FLOW = SolverSettings(), OdeSolver(method="midpoint", steps=1)
 _OPTIMISER, _FOLDS = OptimiserSettings(), FoldSettings()
@@ -242,8 +284,10 @@ class RegistrationSettings:
         align: how images (not tensors) are aligned first; as one value its ``kind``: ``none``, ``translation``,
             ``rigid``, ``similarity`` or ``affine``.
         start: map to begin with: ``identity``, ``discrete`` for one from a search over large displacements, see
-            `discrete_start`, or ``auto``: discrete where ``mind`` is compared.
-        discrete: settings of that search.
+            `discrete_start`, ``keypoints`` for one from points that look alike however far they are apart, see
+            `keypoint_start`, or ``auto``: discrete where ``mind`` is compared.
+        discrete: settings of the first search.
+        keypoints: settings of the second.
         similarity: what is compared; as one value its ``measure``.
         metric: what a velocity costs.
         solver: how the least squares for the velocity are solved; as one value its ``method``: ``auto``,
@@ -282,6 +326,7 @@ class RegistrationSettings:
     align: AlignmentSettings = _ALIGN
     start: str = AUTO
     discrete: DiscreteSettings = _DISCRETE
+    keypoints: KeypointSettings = _KEYPOINTS
     similarity: SimilaritySettings = _SIMILARITY
     metric: MetricSettings = _METRIC
     solver: SolverSettings = _SOLVER
@@ -378,9 +423,11 @@ class RegistrationSettings:
         return bool(self.tissues or self.sliding)
 
     @property
-    def starts_discretely(self) -> bool:
-        """Whether the map to begin with is searched for."""
-        return self.start == "discrete" or (self.start == AUTO and self.similarity.measure == "mind")
+    def decided_start(self) -> str:
+        """The map to begin with, which ``auto`` leaves to the measure."""
+        if self.start != AUTO:
+            return self.start
+        return "discrete" if self.similarity.measure == "mind" else "identity"
 
     def decided(self, measure: str = "lncc") -> "RegistrationSettings":
         """Return the same with this measure in place of ``auto``, and with the start that goes with it."""
@@ -388,4 +435,4 @@ class RegistrationSettings:
         similarity = self.similarity
         similarity = replace(similarity, measure=measure) if similarity.measure == AUTO else similarity
         chosen = replace(self, similarity=similarity)
-        return replace(chosen, start="discrete" if chosen.starts_discretely else "identity")
+        return replace(chosen, start=chosen.decided_start)

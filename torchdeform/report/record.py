@@ -51,6 +51,7 @@ def describe(result: RegistrationResult, fixed: Image, moving: Image) -> dict[st
         "inverse_error_max": result.inverse_error_max.item(),
         "seconds": result.seconds,
         "alignment": _alignment(result),
+        "keypoints": [{"looked_for": points.looked_for, "matched": points.count} for points in result.keypoints],
         "evaluation": _evaluation(result.evaluation, fixed),
         "tissue": [_tissue(outcome) for outcome in result.tissue],
         "label_interpolation": result.evaluation and result.evaluation.label_interpolation,
@@ -92,7 +93,7 @@ def _alignment(result: RegistrationResult) -> dict[str, object]:
         return {"kind": "none"}
     found = result.alignment
     return {
-        "kind": result.settings.align.kind if found else "given",
+        "kind": result.settings.align.kind if found else "keypoints" if result.keypoints else "given",
         "matrix": result.affine.matrix.tolist(),
         "offset": result.affine.offset.tolist(),
         "start": found and found.start,
