@@ -22,7 +22,7 @@ from torchdeform.metrics.mind import mind_ssc
 from torchdeform.registration import channels as made
 from torchdeform.registration.channels import count_features, run_program, with_channels
 from torchdeform.registration.deformable import register
-from torchdeform.registration.optimise import Addition, forward_objective
+from torchdeform.registration.objective import forward_objective
 from torchdeform.registration.problem import Annotations, Channels, RegistrationProblem, moved
 from torchdeform.registration.symmetric import symmetric_objective
 
@@ -327,17 +327,3 @@ def test_settings_and_what_is_given_must_go_together():
     ):
         with pytest.raises(InputError, match=problem):
             register(image, image, QUICK, annotations=Annotations(fixed_features=features, moving_features=other))
-
-
-def test_an_addition_counts_in_the_choice_of_the_best_map():
-    shape = (40, 40)
-    grid, image, labels = Grid(shape), blobs(shape), quarters(shape)
-    settings = settings_of(labels_weight=1.0).decided()
-    problem = with_channels(RegistrationProblem(grid, image, image, labels=(labels, labels)), settings)
-    objective = forward_objective(problem, grid, settings)
-    maps = [torch.zeros(1, 2, *shape), bend(grid, 3.0)]
-    alone = objective.similarity.on_common_voxels(maps)
-    whole = objective.on_common_voxels(maps, maps)
-    assert whole[0] == alone[0]
-    assert whole[1] < alone[1]
-    assert isinstance(objective.more[0], Addition)

@@ -18,6 +18,7 @@ from torchdeform.core.resampling import coarsened
 from torchdeform.core.warp import warp
 from torchdeform.registration import optimise as levels
 from torchdeform.registration.deformable import register
+from torchdeform.registration.objective import Objective, forward_objective
 from torchdeform.registration.problem import Annotations, RegistrationProblem
 from torchdeform.registration.tissue import Tissue
 from torchdeform.registration.velocity import VelocityMetric
@@ -55,7 +56,7 @@ def test_slabs_of_a_coarser_map_are_what_its_whole_displacement_gives(monkeypatc
     grid = Grid(shape)
     fixed, moving, mask = (torch.rand(2, 1, *shape, dtype=torch.float64) for _ in range(3))
     problem = RegistrationProblem(grid, fixed, moving, None, mask if masked else None)
-    level = levels.make_level(problem, settings_of(measure="lncc"), levels.forward_objective, 0, 1)
+    level = levels.make_level(problem, settings_of(measure="lncc"), forward_objective, 0, 1)
     assert level.transfer is not None
     u, term = torch.randn_like(level.zero), level.objective.similarity
     whole = F.interpolate(u, shape, mode={2: "bilinear", 3: "trilinear"}[len(shape)], align_corners=True)
@@ -70,7 +71,7 @@ def level_of(grid: Grid, flow: str = "midpoint", **settings) -> levels.Level:
     chosen = settings_of(flow=flow, elasticity=0.0, **settings)
     like = torch.zeros(1, 1, *grid.shape, dtype=torch.float64)
     metric = VelocityMetric.of(grid, chosen.metric, chosen.solver, like)
-    return levels.Level(levels.Objective(None), metric, chosen, steps=1)
+    return levels.Level(Objective(None), metric, chosen, steps=1)
 
 
 def state_of(u: torch.Tensor, grid: Grid) -> levels.State:
@@ -152,14 +153,11 @@ def test_a_level_has_the_tissue_of_its_map(monkeypatch):
     tissue = Tissue.of(labels, settings, moving)
     problem = RegistrationProblem(Grid((64, 64)), moving, moving, tissue=tissue)
     monkeypatch.setattr(levels, "_LARGE", 1000)
-    level = levels.make_level(problem, settings.decided(), levels.forward_objective, 0, 1)
+    level = levels.make_level(problem, settings.decided(), forward_objective, 0, 1)
     assert level.grid != problem.grid
     assert level.tissue.shares.shape[2:] == level.grid.shape
     assert level.hold is not None
-    assert (
-        levels.make_level(replace(problem, tissue=None), settings.decided(), levels.forward_objective, 0, 1).hold
-        is None
-    )
+    assert levels.make_level(replace(problem, tissue=None), settings.decided(), forward_objective, 0, 1).hold is None
 
 
 def test_large_levels_keep_rigid_what_is_rigid(monkeypatch):
@@ -169,9 +167,3 @@ def test_large_levels_keep_rigid_what_is_rigid(monkeypatch):
     result = register(fixed, moving, settings, annotations=Annotations(tissue=labels))
     assert max(kabsch_residual(result.displacement[0], labels[0, 0] == number) for number in (1, 2)) < 0.05
     assert result.diagnosis.folds.item() == 0
-
-
-def test_maps_of_a_batch_are_by_themselves_without_a_coupling():
-    coupling, v = levels.Coupling(), torch.randn(2, 2, 5, 6)
-    for same in (coupling.velocity, coupling.extended, coupling.counted, coupling.all, coupling.together):
-        assert same(v) is v

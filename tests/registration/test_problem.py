@@ -18,7 +18,7 @@ from torchdeform.core.transform import Affine
 from torchdeform.core.warp import sample, warp
 from torchdeform.errors import InputError
 from torchdeform.registration.deformable import register
-from torchdeform.registration.optimise import compared, forward_similarity
+from torchdeform.registration.objective import compared, forward_similarity
 from torchdeform.registration.problem import Annotations, RegistrationProblem, moved, placed_images, resample_pair
 from torchdeform.registration.tissue import Tissue
 

@@ -14,8 +14,10 @@ from torchdeform.fem.weights import Weights
 from torchdeform.registration.tissue import Tissue
 from torchdeform.registration.velocity import (
     VelocityMetric,
+    evened,
     fold_barrier,
     image_force,
+    limited_step,
     max_norm,
     normalise_step,
     step_size,
@@ -174,3 +176,44 @@ def test_items_that_are_scaled_together_keep_their_proportions(grid):
     together = normalise_step(v, grid, lambda sizes: sizes.amax().expand_as(sizes))
     torch.testing.assert_close(together[0] / together[1], v[0] / v[1])
     assert max_norm(together / grid.along(grid.spacing, v)).amax() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_a_limited_step_keeps_directions_and_cuts_what_is_long(grid):
+    v = field(grid, grid.dim)
+    v[1] *= 5.0  # items are scaled by themselves
+    v[:, :, 3, 3] *= 3
+    found = limited_step(v, grid, 1.5)
+    moves = (found / grid.along(grid.spacing, v)).norm(dim=1)
+    assert moves.flatten(1).amax(1).tolist() == pytest.approx([1.0, 1.0])
+    along = torch.nn.functional.cosine_similarity(found, v, dim=1)
+    torch.testing.assert_close(along, torch.ones_like(along))
+    size = (v / grid.along(grid.spacing, v)).norm(dim=1)
+    limit = 1.5 * (size**4).flatten(1).sum(1).div((size**2).flatten(1).sum(1)).sqrt()
+    torch.testing.assert_close(moves, (size / per_item(limit, size)).clamp(max=1.0))
+
+
+def test_a_limited_step_does_not_know_how_much_background_there_is():
+    grid, wide = Grid((20, 20)), Grid((80, 80))
+    v = field(grid, 2)
+    padded = torch.nn.functional.pad(v, (30, 30, 30, 30))
+    torch.testing.assert_close(limited_step(padded, wide, 1.5)[..., 30:50, 30:50], limited_step(v, grid, 1.5))
+
+
+def test_a_step_that_nothing_asks_for_is_none():
+    grid = GRIDS[0]
+    zero = torch.zeros(2, 2, *grid.shape)
+    assert torch.equal(limited_step(zero, grid, 1.5), zero)
+    assert torch.equal(evened(zero, 0.1), zero)
+
+
+def test_an_even_force_leads_the_same_way_and_is_as_strong_in_weak_places():
+    force = field(Grid((60, 60)), 2)
+    force[..., 30:] *= 0.01
+    found = evened(force, 1e-3)
+    along = torch.nn.functional.cosine_similarity(found, force, dim=1)
+    torch.testing.assert_close(along, torch.ones_like(along))
+    left, right = (found[..., part].square().mean().sqrt() for part in (slice(5, 20), slice(40, 55)))
+    assert right / left == pytest.approx(1.0, abs=0.2)  # it was 0.01
+    torch.testing.assert_close(evened(force, 1e6), force, rtol=1e-4, atol=1e-6)  # a large share changes nothing
+    torch.testing.assert_close(evened(1e-3 * force, 0.1), 1e-3 * evened(force, 0.1))  # nor does the unit matter

@@ -12,7 +12,8 @@ from torchdeform.core.warp import warp
 from torchdeform.errors import InputError, require_choice, require_ranges
 from torchdeform.metrics.similarity import MEASURES
 from torchdeform.nn.precision import full_precision
-from torchdeform.registration.optimise import Level, Objective, elasticity_of, optimise_level
+from torchdeform.registration.objective import Objective
+from torchdeform.registration.optimise import Level, elasticity_of, optimise_level
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.velocity import VelocityMetric
 

@@ -11,7 +11,8 @@ from torchdeform.core.grid import Grid, limit_threads
 from torchdeform.core.resampling import with_nodes
 from torchdeform.core.warp import warp
 from torchdeform.registration.evidence import ROUGH, Views
-from torchdeform.registration.optimise import forward_objective, make_level
+from torchdeform.registration.objective import forward_objective
+from torchdeform.registration.optimise import make_level
 from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.settings import MetricSettings, RegistrationSettings, SimilaritySettings
 from torchdeform.registration.velocity import image_force, normalise_step

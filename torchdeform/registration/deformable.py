@@ -24,7 +24,8 @@ from torchdeform.registration.channels import count_features, settled, with_chan
 from torchdeform.registration.discrete import discrete_start
 from torchdeform.registration.evidence import gather_evidence, to_compare, with_labels
 from torchdeform.registration.keypoints import Keypoints, keypoint_start, too_few
-from torchdeform.registration.optimise import best_map, common_mask, forward_objective, held_still, optimise_levels
+from torchdeform.registration.objective import common_mask, forward_objective
+from torchdeform.registration.optimise import best_map, held_still, optimise_levels
 from torchdeform.registration.placement import Placement, place, problem_at
 from torchdeform.registration.problem import (
     Annotations,

@@ -21,14 +21,8 @@ from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity, weighted
 from torchdeform.registration.landmarks import ForwardLandmarks
-from torchdeform.registration.optimise import (
-    Coupling,
-    Objective,
-    SimilarityTerm,
-    forward_objective,
-    held_still,
-    optimise_levels,
-)
+from torchdeform.registration.objective import Coupling, Objective, SimilarityTerm, forward_objective
+from torchdeform.registration.optimise import held_still, optimise_levels
 from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.result import Callback, LevelRecord
 from torchdeform.registration.settings import RegistrationSettings

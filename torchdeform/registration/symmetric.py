@@ -21,14 +21,8 @@ from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity
 from torchdeform.metrics.similarity import make_similarity
 from torchdeform.registration.landmarks import MidspaceLandmarks, of_other_map
-from torchdeform.registration.optimise import (
-    Coupling,
-    Objective,
-    SimilarityTerm,
-    additions,
-    compared,
-    optimise_levels,
-)
+from torchdeform.registration.objective import Coupling, Objective, SimilarityTerm, additions, compared
+from torchdeform.registration.optimise import optimise_levels
 from torchdeform.registration.problem import Channels, PlacedImage, RegistrationProblem, resample_pair
 from torchdeform.registration.result import Callback, LevelRecord
 from torchdeform.registration.settings import RegistrationSettings
