@@ -134,7 +134,8 @@ def test_a_motion_of_25_voxels_is_found_in_a_volume():
     plateau = ((0.5 - (inside - 0.5).abs()) * 4).clamp(max=1).prod(1, keepdim=True)
     truth = grid.along([12.0, -18.0, 12.0], plateau) * (3 - 2 * plateau) * plateau**2
     fixed = warp(moving, truth, grid)
-    started = td.register(fixed, moving, td.RegistrationSettings(start="keypoints"))
+    plain, started = (td.register(fixed, moving, td.RegistrationSettings(start=s)) for s in ("identity", "keypoints"))
+    assert mean_error(plain.displacement, truth, grid) > 4
     assert mean_error(started.displacement, truth, grid) < 1
     assert started.diagnosis.folds.item() == 0
 
