@@ -13,8 +13,9 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import warp
+from torchdeform.metrics.similarity import measure_name, similarity_weights
 from torchdeform.registration.affine.align import Alignment
-from torchdeform.registration.placement import place, sign_agreement
+from torchdeform.registration.placement import choose, place, sign_agreement
 from torchdeform.registration.problem import Annotations, RegistrationProblem
 from torchdeform.registration.settings import RegistrationSettings
 
@@ -130,11 +131,23 @@ def test_the_contrast_tells_the_similarity(shape, values, measure):
     fixed = as_image(tissues(shape, 1, (0.0, 0.3, 0.6, 1.0)))
     moving = as_image(warp(tissues(shape, 2, values), bend(grid, 2.0), grid))
     placed = place(fixed, moving, changed(SETTINGS, align="none"), Annotations())
-    assert placed.settings.similarity.measure == measure
+    assert measure in similarity_weights(placed.settings.similarity.measure)
     assert placed.settings.start == ("discrete" if measure == "mind" else "identity")
-    assert placed.choice.startswith(f"similarity {measure}: the images have ")
+    assert placed.choice.startswith(f"similarity {measure_name(placed.settings.similarity.measure)}: the images have ")
     given = place(fixed, moving, changed(SETTINGS, align="none", similarity="ncc"), Annotations())
     assert (given.settings.similarity.measure, given.choice) == ("ncc", None)
+
+
+def test_edges_count_beside_self_similarities_the_less_the_more_noise_there_is():
+    grid = Grid((96, 96))
+    fixed, moving = tissues(grid.shape, 1, (0.0, 0.3, 0.6, 1.0)), tissues(grid.shape, 2, (0.1, 1.0, 0.3, 0.7))
+    weights = []
+    for deviation in (0.0, 0.03, 0.3):
+        noise = deviation * torch.randn(1, 1, *grid.shape, generator=torch.manual_seed(0))
+        problem = RegistrationProblem(grid, fixed + noise, moving).scaled(SETTINGS)
+        chosen = choose(problem, changed(SETTINGS, similarity="auto"))[0].similarity.measure
+        weights.append(similarity_weights(chosen).get("ngf", 0.0))
+    assert weights[0] > weights[1] > weights[2] == 0
 
 
 def test_sign_agreement_of_one_half_and_the_other():

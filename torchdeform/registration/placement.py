@@ -12,7 +12,7 @@ from torchdeform.core.transform import Affine
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import weighted
 from torchdeform.metrics.correlation import LNCC_FLOOR, contrast, local_contrast, window_mean, window_moments
-from torchdeform.metrics.similarity import mark
+from torchdeform.metrics.similarity import mark, measure_name
 from torchdeform.registration.affine.align import Alignment, align
 from torchdeform.registration.keypoints import common_shift
 from torchdeform.registration.problem import Annotations, PlacedImage, RegistrationProblem, placed_images, resample_pair
@@ -27,6 +27,9 @@ _GAIN = 1e-4
 # Local correlations are compared on at most so many nodes to the power of D, in windows of so many, which count half
 # where their standard deviation is a grey level of 3 %.
 _NODES, _WINDOW, _CLEAR = 128, 9, 0.03
+
+# Weight of the directions of edges beside self-similarities without noise; with so large a share of noise none.
+_EDGES, _NOISY = 0.3, 0.2
 
 # Share of one sign in the local correlations from which on both images have one contrast. On the pairs of one contrast
 # in docs/accuracy.md it is 0.92 and more, in two contrasts 0.09 to 0.45 (spine T1 and T2, brain maps painted as both).
@@ -157,17 +160,29 @@ def choose(problem: RegistrationProblem, settings: RegistrationSettings) -> tupl
 
     Notes:
         ``lncc`` where one intensity is locally a linear function of the other, which shows in local correlations of one
-        sign, and ``mind`` with a discrete start where they change their sign from place to place.
+        sign; where they change their sign from place to place ``mind``, with ``ngf`` beside it the less noise there is,
+        and a discrete start.
     """
     if settings.similarity.measure != AUTO:
         return settings.decided(), None
     if settings.only_features:
         return settings.decided(), "similarity ssd: features are compared by the squared difference of unit vectors"
     agreement = sign_agreement(problem)
-    measure = "lncc" if agreement >= _ONE_CONTRAST else "mind"
-    kind = "one contrast" if measure == "lncc" else "different contrasts"
-    sentence = f"similarity {measure}: the images have {kind} (local correlations of one sign: {agreement:.0%})"
+    measure = "lncc" if agreement >= _ONE_CONTRAST else _across_contrasts(problem)
+    kind, name = "one contrast" if measure == "lncc" else "different contrasts", measure_name(measure)
+    sentence = f"similarity {name}: the images have {kind} (local correlations of one sign: {agreement:.0%})"
     return settings.decided(measure), sentence
+
+
+def _across_contrasts(problem: RegistrationProblem) -> str | dict[str, float]:
+    """Return the measure for images of different contrast: edges are sharper than self-similarities, but noise has any.
+
+    With ``ngf`` beside ``mind`` label maps painted as T1 and T2 (noise of 5 to 10 %) end 0.02 Dice nearer; a spine with
+    23 % of noise ends 0.06 to 0.09 farther.
+    """
+    noise = 0.0 if problem.noise is None else float(problem.noise.share.amax())
+    edges = round(_EDGES * (1 - noise / _NOISY), 2)
+    return {"mind": 1.0, "ngf": edges} if edges > 0 else "mind"
 
 
 def sign_agreement(problem: RegistrationProblem) -> float:

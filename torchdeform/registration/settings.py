@@ -427,9 +427,9 @@ class RegistrationSettings:
         """The map to begin with, which ``auto`` leaves to the measure."""
         if self.start != AUTO:
             return self.start
-        return "discrete" if self.similarity.measure == "mind" else "identity"
+        return "discrete" if MIND in similarity_weights(self.similarity.measure) else "identity"
 
-    def decided(self, measure: str = "lncc") -> "RegistrationSettings":
+    def decided(self, measure: str | Mapping[str, float] = "lncc") -> "RegistrationSettings":
         """Return the same with this measure in place of ``auto``, and with the start that goes with it."""
         measure = "ssd" if self.only_features else measure
         similarity = self.similarity
