@@ -135,7 +135,8 @@ def _choice(table: Table, scores: Sequence[Score], chosen: Mapping[Place, str], 
     """Return the cells of a set: its figure by default and held out, the gain, who got what, the best in hindsight."""
     which, given = scores[0].set, {}
     for score in scores:
-        given.setdefault(chosen[which, score.pair], []).append(score.pair)
+        who = " + ".join(sorted(subject.rpartition("/")[2] for subject in score.subjects))
+        given.setdefault(chosen[which, score.pair], {})[who] = None  # once for all pairs of the same subjects
     told = "; ".join(f"{name}: {', '.join(who) if len(given) > 1 else 'all'}" for name, who in given.items())
     means = {name: mean(score.errors[name] for score in scores) for name in names}
     best = min(means, key=means.__getitem__)
