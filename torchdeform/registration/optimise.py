@@ -14,8 +14,7 @@ from torchdeform.core.diagnostics import one_sided_determinant
 from torchdeform.core.flow import flow
 from torchdeform.core.fold_free import largest_share, repair_folds, smooth_elastically, where_items
 from torchdeform.core.grid import Grid, limit_threads, per_item
-from torchdeform.core.regions import grown
-from torchdeform.core.resampling import Transfer, coarsened, prolong, pyramid_grids
+from torchdeform.core.resampling import Transfer, box_sum, coarsened, prolong, pyramid_grids
 from torchdeform.core.warp import compose
 from torchdeform.deformation.rigid import RigidHold
 from torchdeform.errors import InputError
@@ -343,10 +342,16 @@ def fold_free_step(level: Level, state: State, v: Tensor) -> tuple[Tensor, Tenso
         folded = ~coupling.all(lowest >= per_item(floor, lowest))
         if not bool(folded.any()):
             return around.flatten(1).amin(1), u, lowest
-        around = around * (1 - _CUT * window_mean(grown(folded, _WITHIN).to(v), 2 * _WITHIN + 1))
+        around = around * (1 - _CUT * _near(folded.to(v)))
     share = largest_share(accept, floor, halvings=_HALVINGS)
     good = share > 0
     return share * around.flatten(1).amin(1), where_items(good, u, state.u), where_items(good, lowest, state.lowest)
+
+
+def _near(nodes: Tensor) -> Tensor:
+    """Return 1 near nodes that are 1 and not 0 ``(B, 1, *S)``, falling to 0 over so many nodes again."""
+    width = 2 * _WITHIN + 1
+    return window_mean((box_sum(nodes, width) > 0.5).to(nodes), width)
 
 
 def _moved(level: Level, state: State, v: Tensor, share: Tensor, floor: Tensor) -> tuple[Tensor, Tensor]:
