@@ -26,9 +26,6 @@ LNCC_FLOOR = 1e-5
 # Windows of the fixed image with this standard deviation have weight 1/2 in LNCC; its intensities are scaled to [0, 1].
 LNCC_CONTRAST = 0.01
 
-# With noise it is at least so many standard deviations of the noise.
-_NOISE = 2.0
-
 # Added to both variances of NCC: images flatter than a grey level of 0.01 % are flat.
 NCC_FLOOR = 1e-8
 
@@ -127,8 +124,6 @@ class LocalCrossCorrelation(Similarity):
         fixed: ``(B, C, *S)``, scaled to about [0, 1].
         window: width in voxels, odd. At the boundary the part of the window inside the image counts.
         stride: voxels from one x to the next along every axis.
-        noise: variance σ² of the noise in each channel ``(B, C)``, see `noise_of`; none when None. Then t has v_f − σ²
-            in place of v_f, and τ = max(0.01, 2 σ).
 
     Notes:
         Lies in [0, 1], and is 1 for equal images, where the derivative is 0: with ε in the variances alone, noise in
@@ -141,15 +136,15 @@ class LocalCrossCorrelation(Similarity):
         Not differentiable, see `lncc`.
     """
 
-    def __init__(self, fixed: Tensor, window: int = 9, stride: int = 1, noise: Tensor | None = None) -> None:
-        self.fixed, self.window, self.stride, self.noise = at_least_float32(fixed), window, stride, noise
+    def __init__(self, fixed: Tensor, window: int = 9, stride: int = 1) -> None:
+        self.fixed, self.window, self.stride = at_least_float32(fixed), window, stride
         self._last: tuple[Tensor | None, int, _Windows] | None = None
 
     def _windows(self, mask: Tensor | None, warped: Tensor) -> _Windows:
         """Return what depends on the mask only; kept for the next call, in which it is often the same."""
         version = 0 if mask is None or mask.is_inference() else mask._version
         if self._last is None or self._last[0] is not mask or self._last[1] != version:
-            windows = _windows(self.fixed, relative_weight(mask, warped), self.window, self.stride, self.noise)
+            windows = _windows(self.fixed, relative_weight(mask, warped), self.window, self.stride)
             self._last = mask, version, windows
         return self._last[2]
 
@@ -190,7 +185,6 @@ def lncc(
     window: int = 9,
     intensity_range: IntensityRange = None,
     stride: int = 1,
-    noise: Tensor | None = None,
 ) -> Tensor:
     """Return S = mean over x of t (|c| + ε)² / ((v_f + ε)(v_w + ε)), covariance and variances in the window around x.
 
@@ -204,7 +198,6 @@ def lncc(
         intensity_range: intensities taken for 0 and 1, which gives ε = 1e-5 and τ = 0.01 their meaning; None: the
             smallest and the largest of each image where the mask is positive.
         stride: voxels from one x to the next along every axis.
-        noise: its variance in each channel ``(B, C)``, for intensities from 0 to 1, see `LocalCrossCorrelation`.
 
     Returns:
         ``(B,)`` between 0 and 1: 1 for equal images, about 1 / (voxels of a window − 1) for white noise.
@@ -216,18 +209,18 @@ def lncc(
         Differentiable. `LocalCrossCorrelation` has the derivative in closed form.
     """
     fixed, warped = on_unit_scale(fixed, warped, mask, intensity_range)
-    windows = _windows(fixed, relative_weight(mask, warped), window, stride, noise)
+    windows = _windows(fixed, relative_weight(mask, warped), window, stride)
     warped_mean, variance = _moments(warped, windows.weight, windows.inverse_count, window, stride)
     product = box_sum(weighted(fixed * warped, windows.weight), window, stride) * windows.inverse_count
     covariance = _raised(product - windows.mean * warped_mean)
     return mean(covariance.square() / (windows.variance * (variance + LNCC_FLOOR)), windows.window_weight)
 
 
-def _windows(fixed: Tensor, weight: Tensor | None, window: int, stride: int, noise: Tensor | None = None) -> _Windows:
+def _windows(fixed: Tensor, weight: Tensor | None, window: int, stride: int) -> _Windows:
     ones = fixed.new_ones(1, 1, *fixed.shape[2:]) if weight is None else weight
     inverse_count = 1 / box_sum(ones, window, stride).clamp(min=_EMPTY)
     middle, variance = _moments(fixed, weight, inverse_count, window, stride)
-    counted = contrast(variance, noise=noise)
+    counted = contrast(variance)
     counted = counted if weight is None else counted * centres(weight, stride)
     counted = counted / per_item(counted.flatten(1).mean(1).clamp(min=_FLAT), counted)
     return _Windows(weight, counted, inverse_count, middle, variance + LNCC_FLOOR)
@@ -238,17 +231,10 @@ def _raised(covariance: Tensor) -> Tensor:
     return covariance + torch.full_like(covariance, LNCC_FLOOR).copysign(covariance)
 
 
-def contrast(variance: Tensor, deviation: float = LNCC_CONTRAST, noise: Tensor | None = None) -> Tensor:
-    """Return the weight v² / (v² + τ⁴) of windows with variance v in an image scaled to about [0, 1], τ a deviation.
-
-    With the variance σ² of ``noise`` ``(B, C)`` it is that of v − σ² and of τ = max(deviation, 2 σ).
-    """
-    if noise is None:
-        square = variance.square()
-        return square / (square + deviation**4)
-    noise = noise.repeat(len(variance) // len(noise), 1).view(*variance.shape[:2], *[1] * (variance.dim() - 2))
-    square = (variance - noise).clamp(min=0).square()
-    return square / (square + (_NOISE**2 * noise).clamp(min=deviation**2).square())
+def contrast(variance: Tensor, deviation: float = LNCC_CONTRAST) -> Tensor:
+    """Return the weight v² / (v² + τ⁴) of windows with variance v in an image scaled to about [0, 1], τ a deviation."""
+    square = variance.square()
+    return square / (square + deviation**4)
 
 
 def _moments(

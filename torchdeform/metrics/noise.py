@@ -1,7 +1,5 @@
 """How much of an image is noise: what of it no neighbour shares."""
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -13,33 +11,19 @@ from torchdeform.metrics.correlation import LNCC_FLOOR, contrast
 _WINDOW, _STRIDE = 9, 3
 
 
-@dataclass(frozen=True)
-class Noise:
-    """The noise of images on one scale.
-
-    Attributes:
-        variance: of the noise in each channel ``(B, C)``, in squared units of intensity.
-        share: of the variance in a window that is noise ``(B,)``, on average; 1 for white noise alone.
-    """
-
-    variance: Tensor
-    share: Tensor
-
-    def larger(self, other: "Noise") -> "Noise":
-        """Return the larger noise of both, item by item."""
-        return Noise(torch.maximum(self.variance, other.variance), torch.maximum(self.share, other.share))
-
-
 @torch.no_grad()
-def noise_of(image: Tensor, mask: Tensor | None = None) -> Noise:
-    """Return σ² = mean of (Δ_1 .. Δ_D image)² / 2^D, Δ_k being differences of neighbours along axis k.
+def noise_share(image: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return the mean of σ² / (v + ε) over windows of variance v, σ² being the mean of (Δ_1 .. Δ_D image)² / 2^D there.
+
+    Δ_k is the difference of neighbours along axis k.
 
     Args:
         image: ``(B, C, *S)``, scaled to about [0, 1].
         mask: weight of each voxel ``(B, 1, *S)``, 0 to 1; all ones when None.
 
     Returns:
-        `Noise`. Windows count as much as they have contrast.
+        ``(B,)``, the mean over channels: 1 for white noise alone, 0 for what is smooth. Windows count as much as they
+        have contrast.
 
     Notes:
         Exact on average for white noise on what is smooth across a diagonal; structures of a voxel's size count as
@@ -55,6 +39,5 @@ def noise_of(image: Tensor, mask: Tensor | None = None) -> Noise:
     mean, square, noise = (box_sum(weighted(fields, mask), _WINDOW, _STRIDE) / count).chunk(3, dim=1)
     variance = (square - mean * mean).clamp(min=0)
     seen = weighted(contrast(variance), None if mask is None else centres(mask, _STRIDE))
-    total = seen.flatten(2).sum(2).clamp(min=1e-6)
-    share = (seen * noise / (variance + LNCC_FLOOR)).flatten(2).sum(2) / total
-    return Noise((seen * noise).flatten(2).sum(2) / total, share.mean(1))
+    share = (seen * noise / (variance + LNCC_FLOOR)).flatten(2).sum(2) / seen.flatten(2).sum(2).clamp(min=1e-6)
+    return share.mean(1)

@@ -49,7 +49,7 @@ class Measure:
         memory: bytes that a registration holds for each voxel and channel, in 2D and in 3D, measured by
             ``scripts/benchmarks/memory.py``.
         time: time of a step over that of a step with LNCC.
-        options: what both take of ``window`` (width in voxels), ``grid`` and ``noise`` (variance in each channel).
+        options: what both take of ``window`` (width in voxels) and ``grid``.
         features: what of the images is compared.
         best: S of an image with itself; None where it depends on the image.
         unrelated: returns S of features that have nothing to do with each other, from those of both images
@@ -77,8 +77,8 @@ class Measure:
         return self.features is not INTENSITIES
 
     def choose(self, **available: object) -> dict[str, Any]:
-        """Return those of the options that this measure takes and that are given."""
-        return {name: available[name] for name in self.options if name in available}
+        """Return those of the options ``window`` and ``grid`` that this measure takes."""
+        return {name: available[name] for name in self.options}
 
 
 # What ``auto`` chooses for most images.
@@ -89,8 +89,8 @@ _USUAL = "lncc"
 _WINDOWS_OVER = 3
 
 
-def _sparse_lncc(fixed: Tensor, window: int, noise: Tensor | None = None) -> Similarity:
-    return LocalCrossCorrelation(fixed, window, max(1, window // _WINDOWS_OVER), noise)
+def _sparse_lncc(fixed: Tensor, window: int) -> Similarity:
+    return LocalCrossCorrelation(fixed, window, max(1, window // _WINDOWS_OVER))
 
 
 def _variances(fixed: Tensor, warped: Tensor, weight: Tensor | None, own: Tensor) -> Tensor:
@@ -114,7 +114,7 @@ MEASURES = {
         _sparse_lncc,
         (45.0, 40.0),
         1.0,
-        ("window", "noise"),
+        ("window",),
         best=1.0,
         weighs_contrast=True,
         references=("avants2008symmetric",),
@@ -230,12 +230,7 @@ def features(similarity: str | Mapping[str, float], image: Tensor) -> Tensor:
 
 
 def make_similarity(
-    similarity: str | Mapping[str, float],
-    fixed: Tensor,
-    window: int = 9,
-    *,
-    grid: Grid | None = None,
-    noise: Tensor | None = None,
+    similarity: str | Mapping[str, float], fixed: Tensor, window: int = 9, *, grid: Grid | None = None
 ) -> Similarity:
     """Return the similarity of that name, or of those names and weights, to ``fixed``.
 
@@ -244,7 +239,6 @@ def make_similarity(
         fixed: ``(B, C', *S)``, the `features` of the fixed image.
         window: width of the LNCC window in voxels.
         grid: their grid, whose spacing the gradients of ``ngf`` need; spacing 1 when None.
-        noise: variance of the noise in each channel ``(B, C)``, which ``lncc`` leaves out; none when None.
 
     Returns:
         A `Similarity` whose ``evaluate`` takes the warped features of the moving image.
@@ -257,7 +251,7 @@ def make_similarity(
     for name, weight in similarity_weights(similarity).items():
         measure = MEASURES[name]
         compared = channels[measure.features]
-        part = measure.closed_form(fixed[:, compared], **measure.choose(window=window, grid=grid, noise=noise))
+        part = measure.closed_form(fixed[:, compared], **measure.choose(window=window, grid=grid))
         parts.append((weight, compared, part))
     return parts[0][2] if len(parts) == 1 else Combination(parts)
 

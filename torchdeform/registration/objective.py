@@ -108,16 +108,14 @@ def compared(problem: RegistrationProblem, settings: RegistrationSettings) -> tu
         return problem.channels
     measure = settings.similarity.measure
     fixed, moving = (features(measure, image) for image in (problem.fixed, problem.moving))
-    noise = problem.noise and problem.noise.variance
-    return Channels(problem.grid, fixed, moving, measure, noise=noise), *problem.channels
+    return Channels(problem.grid, fixed, moving, measure), *problem.channels
 
 
 def forward_similarity(
     problem: RegistrationProblem, channels: Channels, settings: RegistrationSettings
 ) -> SimilarityTerm:
     """Return the similarity of the fixed and the warped moving channels."""
-    window, noise = settings.similarity.window, channels.noise
-    similarity = make_similarity(channels.measure, channels.fixed, window, grid=channels.grid, noise=noise)
+    similarity = make_similarity(channels.measure, channels.fixed, settings.similarity.window, grid=channels.grid)
     fixed_mask, moving_mask = problem.masks_on(channels.grid)
     return SimilarityTerm(channels.grid, channels.moving, similarity, moving_mask, fixed_mask)
 

@@ -19,7 +19,6 @@ from torchdeform.core.warp import compose
 from torchdeform.deformation.rigid import RigidHold
 from torchdeform.errors import InputError
 from torchdeform.metrics.correlation import window_mean
-from torchdeform.metrics.noise import Noise
 from torchdeform.registration.objective import MakeObjective, Objective, forward_objective
 from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.result import Callback, LevelRecord, Progress
@@ -209,14 +208,13 @@ def _map_grid(grid: Grid, settings: RegistrationSettings, below: int) -> Grid:
     return coarsened(grid, settings.optimiser.map_spacing) if large else grid
 
 
-def elasticity_of(settings: MetricSettings, maps: int, noise: Noise | None = None) -> float | Tensor:
+def elasticity_of(settings: MetricSettings, maps: int, noise: Tensor | None = None) -> float | Tensor:
     """Return the elasticity of all maps, or of each of so many ``(maps,)`` by the noise of its images."""
     if not isinstance(settings.elasticity, str):
         return settings.elasticity
     if noise is None:
         return _ELASTICITY
-    share = noise.share.repeat(maps // len(noise.share))
-    return (_CALM + _PER_NOISE * share).clamp(max=_MOST_ELASTIC)
+    return (_CALM + _PER_NOISE * noise.repeat(maps // len(noise))).clamp(max=_MOST_ELASTIC)
 
 
 def optimise_level(

@@ -17,7 +17,7 @@ from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import weighted
 from torchdeform.metrics.correlation import lncc
-from torchdeform.metrics.noise import Noise, noise_of
+from torchdeform.metrics.noise import noise_share
 from torchdeform.metrics.similarity import needs_common_scale
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.registration.tissue import Tissue
@@ -148,7 +148,6 @@ class Channels:
         moving: the same shape.
         measure: the similarity, or several with weights.
         weight: of S, relative to that of what comes first.
-        noise: variance of the noise in each channel of images ``(B, C)``, None without.
     """
 
     grid: Grid
@@ -156,7 +155,6 @@ class Channels:
     moving: Tensor
     measure: str | Mapping[str, float]
     weight: float = 1.0
-    noise: Tensor | None = None
 
     def on(self, coarse: Grid) -> "Channels":
         """Return them on a grid of the same box, if it is coarser."""
@@ -182,7 +180,7 @@ class RegistrationProblem:
         tissue: what the fixed image is made of, None where nothing is said.
         sides: how much of each node belongs to each side of borders that glide ``(B or 1, K, *S)``, where the pairs are
             those of every side and item; None without.
-        noise: of the noisier image of each pair; None before the images are on their scale.
+        noise: `noise_share` of the noisier image of each pair ``(B,)``; None before the images are on their scale.
         features: channels of both images as they are given, or None.
         labels: of both images, whole numbers ``(B, 1, *S)``, where they are compared; or None.
         channels: what is compared beside the intensities, or in their place.
@@ -199,7 +197,7 @@ class RegistrationProblem:
     held: tuple[int, ...] = ()
     tissue: Tissue | None = None
     sides: Tensor | None = None
-    noise: Noise | None = None
+    noise: Tensor | None = None
     features: tuple[Tensor, Tensor] | None = None
     labels: tuple[Tensor, Tensor] | None = None
     channels: tuple[Channels, ...] = ()
@@ -241,7 +239,7 @@ class RegistrationProblem:
             (self.fixed_mask, self.moving_mask),
             jointly=needs_common_scale(settings.seen_by),
         )
-        noise = noise_of(images[0], self.fixed_mask).larger(noise_of(images[1], self.moving_mask))
+        noise = torch.maximum(noise_share(images[0], self.fixed_mask), noise_share(images[1], self.moving_mask))
         return replace(self, fixed=images[0], moving=images[1], noise=noise)
 
 

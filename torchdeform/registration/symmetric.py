@@ -139,7 +139,7 @@ class _MutualSimilarity(Similarity):
 
     def evaluate(self, warped: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         others, of = of_other_map(warped), self.channels
-        similarity = make_similarity(of.measure, others, self.window, grid=of.grid, noise=of.noise)
+        similarity = make_similarity(of.measure, others, self.window, grid=of.grid)
         value, slope = similarity.evaluate(warped, None if mask is None else mask * of_other_map(mask))
         return (value + of_other_map(value)) / 2, slope
 
