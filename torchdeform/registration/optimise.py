@@ -282,7 +282,7 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     even, limit = settings.optimiser.evenness, settings.optimiser.limit
     whole = level.tissue is not None  # what is rigid turns as a whole
     force = force if even is None or whole else evened(force, even)
-    scale = settings.points_weight * math.prod(grid.shape)  # to the unit of N ∂S/∂warped
+    scale = settings.points_weight * math.prod(grid.shape) * channels  # to the unit of N ∂S/∂warped
     load = None if points is None else points.load(grid) * scale
     # 3. Least squares: div and curl of the velocity are paid for, nearly folded places ask for divergence.
     barrier = fold_barrier(state.lowest, settings.folds.soft_determinant)
