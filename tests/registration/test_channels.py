@@ -20,10 +20,11 @@ from torchdeform.errors import InputError
 from torchdeform.metrics.evaluation import dice
 from torchdeform.metrics.mind import mind_ssc
 from torchdeform.registration import channels as made
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.channels import count_features, run_program, with_channels
 from torchdeform.registration.deformable import register
 from torchdeform.registration.objective import forward_objective
-from torchdeform.registration.problem import Annotations, Channels, RegistrationProblem, moved
+from torchdeform.registration.problem import Channels, RegistrationProblem, moved
 from torchdeform.registration.symmetric import symmetric_objective
 
 QUICK = settings_of(steps=(20, 15, 10), window=7, align="none", start="identity")

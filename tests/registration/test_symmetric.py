@@ -13,8 +13,9 @@ from torchdeform.core.image import Image, resample
 from torchdeform.core.transform import Affine, Transform
 from torchdeform.core.warp import compose, max_voxels, voxels, warp
 from torchdeform.errors import InputError
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.deformable import register
-from torchdeform.registration.problem import Annotations, moved
+from torchdeform.registration.problem import moved
 from torchdeform.registration.symmetric import common_axes, midspace_frame, root
 
 SYMMETRIC = settings_of(steps=(30, 20, 10), step_length=0.5, length_scale=6.0, window=7, symmetric=True, align="none")

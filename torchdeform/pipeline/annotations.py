@@ -9,7 +9,7 @@ from torch import Tensor
 from torchdeform.core.image import Image, overlap, require_same_place
 from torchdeform.errors import InputError
 from torchdeform.pipeline.preflight import ERROR, WARNING, Finding
-from torchdeform.registration.problem import Annotations
+from torchdeform.registration.annotations import Annotations
 
 _MARGIN = 3.0  # voxels by which a landmark may lie outside without a word
 _PIXELS = "px"

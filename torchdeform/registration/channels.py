@@ -20,7 +20,8 @@ from torchdeform.metrics.base import mean, relative_weight, weighted
 from torchdeform.metrics.evaluation import common_labels
 from torchdeform.metrics.mind import mind_ssc, neighbour_pairs
 from torchdeform.metrics.similarity import needs_common_scale, similarity_weights
-from torchdeform.registration.problem import Annotations, Channels, RegistrationProblem
+from torchdeform.registration.annotations import Annotations
+from torchdeform.registration.problem import Channels, RegistrationProblem
 from torchdeform.registration.settings import FILES, INTENSITIES, MIND, RegistrationSettings
 
 # Images are taken through a program in tiles of this width, which begin at multiples of _STEP so that what a network
