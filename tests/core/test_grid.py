@@ -1,6 +1,8 @@
 """The geometry of a grid, and the checks at the boundary of the package."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import FrozenInstanceError
 from threading import get_ident
 
@@ -162,3 +164,25 @@ def test_threads_do_all_parts_and_say_what_went_wrong(monkeypatch):
 
     with pytest.raises(ValueError, match="row 0"), torch.no_grad():
         on_threads(fail, parts, seen.device)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_threads_to_come_begin_with_as_many_threads_as_before(fails):
+    """Also after an error: torch hands the number that one thread sets on to those that begin after it."""
+
+    def work(rows: slice) -> None:
+        if fails:
+            raise ValueError("row")
+
+    def begin_with() -> int:
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(torch.get_num_threads).result()
+
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        with pytest.raises(ValueError, match="row") if fails else nullcontext():
+            on_threads(work, [slice(k, k + 1) for k in range(9)], torch.device("cpu"))
+        assert (torch.get_num_threads(), begin_with()) == (3, 3)
+    finally:
+        torch.set_num_threads(before)

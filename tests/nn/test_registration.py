@@ -3,6 +3,7 @@
 import pytest
 import torch
 from nested_settings import settings_of
+from pictures import bend, blobs, disc
 
 from torchdeform.core.diagnostics import diagnose
 from torchdeform.core.grid import Grid
@@ -63,6 +64,30 @@ def test_gradients_go_through_the_steps(make_displacement):
     values = [refine(fixed, moving, start + h * way).square().sum() for h in (-1e-5, 1e-5)]
     slope = (values[1] - values[0]).item() / 2e-5
     assert (gradients[0] * way).sum().item() == pytest.approx(slope, rel=1e-3)
+
+
+@pytest.mark.parametrize("settings", [{}, {"limit": None}, {"evenness": None}])
+@pytest.mark.parametrize("shape", [(20, 24), (12, 14, 10)])
+def test_what_does_not_move_has_a_gradient_too(shape, settings):
+    """No force in a constant background, no velocity in the corners of the box: a length of 0 has no slope."""
+    grid = Grid(shape)
+    ball = disc(shape, tuple(n / 2 for n in shape), min(shape) / 3).double()
+    moving = (blobs(shape, 1).double() - 2) * ball
+    fixed, way = warp(moving, bend(grid, 1.0).double(), grid), blobs(shape, 2).double() * ball
+    refine = DeformableRegistration(grid, steps=3, settings=settings_of(similarity="ssd", step_length=0.4, **settings))
+
+    def value(h: float | torch.Tensor) -> torch.Tensor:
+        return refine(fixed, moving + h * way).square().sum()
+
+    h = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    slope = torch.autograd.grad(value(h), h)[0].item()
+    assert slope == pytest.approx((value(1e-6) - value(-1e-6)).item() / 2e-6, rel=1e-3)
+
+
+def test_images_that_are_equal_have_gradients():
+    image = blobs((16, 18)).requires_grad_()
+    u = DeformableRegistration(Grid((16, 18)), steps=2, settings=settings_of(similarity="ssd"))(image.detach(), image)
+    assert torch.autograd.grad(u.sum(), image)[0].isfinite().all()
 
 
 def test_without_gradients_nothing_is_kept(make_displacement):

@@ -216,9 +216,11 @@ def on_threads(work: Callable[[slice], None], parts: Sequence[slice], device: to
         with torch.inference_mode(inference), torch.no_grad():  # a thread does not inherit them
             work(part)
 
-    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        deque(pool.map(alone, parts), maxlen=0)
-    torch.set_num_threads(threads)  # what threads to come begin with
+    try:
+        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            deque(pool.map(alone, parts), maxlen=0)
+    finally:
+        torch.set_num_threads(threads)  # what threads to come begin with
 
 
 # Fewer nodes than this are not worth more than one thread: with two, a pair of 216×291 gains a tenth on a quiet machine

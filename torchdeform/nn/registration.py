@@ -95,8 +95,8 @@ class _DifferentiableSimilarity:
     moving: Tensor
     settings: RegistrationSettings
 
-    def evaluate(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the moving image warped by u, S of each item, and N ∂S/∂warped."""
+    def evaluate(self, u: Tensor, transfer: None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the moving image warped by u, S of each item, and N ∂S/∂warped; images and map have one grid."""
         warped, measure = warp(self.moving, u, self.grid), MEASURES[str(self.settings.similarity.measure)]
         options = measure.choose(window=self.settings.similarity.window, grid=self.grid)
         wanted = torch.is_grad_enabled() and (self.fixed.requires_grad or warped.requires_grad)

@@ -150,7 +150,7 @@ def limited_step(v: Tensor, grid: Grid, limit: float, together: Callable[[Tensor
     The longest move of all is often that of a few nodes, many times as long as others; a step that is a multiple of
     the velocity would leave all the others nearly where they are.
     """
-    moves = (v / grid.along(grid.spacing, v)).square().sum(1, keepdim=True).sqrt()
+    moves = _sizes(v / grid.along(grid.spacing, v))
     longest = together((limit * _typical(moves)).clamp(min=torch.finfo(v.dtype).tiny))
     return v / moves.maximum(per_item(longest, v))
 
@@ -161,10 +161,15 @@ def evened(force: Tensor, share: float) -> Tensor:
     Strength r is the root mean square in the window, R the `_typical` one: the factor is (1 + share) R / (r + share R),
     1 where the strength is the typical one. The direction stays, so a step still leads uphill at every node.
     """
-    square = force.square().sum(1, keepdim=True)
-    around, typical = window_mean(square, _AROUND).sqrt(), per_item(_typical(square.sqrt()), square)
+    sizes = _sizes(force)
+    around, typical = window_mean(sizes.square(), _AROUND).sqrt(), per_item(_typical(sizes), sizes)
     least = torch.finfo(force.dtype).tiny
     return force * ((1 + share) * typical / (around + share * typical).clamp(min=least))
+
+
+def _sizes(field: Tensor) -> Tensor:
+    """Return |field| at each node ``(B, 1, *S)``; no number is so small that its gradient is not one, 0 included."""
+    return field.square().sum(1, keepdim=True).clamp(min=torch.finfo(field.dtype).tiny).sqrt()
 
 
 def _typical(sizes: Tensor) -> Tensor:
@@ -177,7 +182,7 @@ def _typical(sizes: Tensor) -> Tensor:
 
 def max_norm(field: Tensor) -> Tensor:
     """Return the largest |field| of each item ``(B,)``."""
-    return field.square().sum(1).flatten(1).amax(1).sqrt()
+    return _sizes(field).flatten(1).amax(1)
 
 
 def step_size(settings: OptimiserSettings, step: int, steps: int) -> float:
