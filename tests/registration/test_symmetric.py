@@ -85,8 +85,8 @@ def test_a_known_map_is_found_as_well_as_without(shape):
     fixed = warp(moving, truth, grid)
     inside = (..., *[slice(4, -4)] * grid.dim)
     errors = []
-    for symmetric in (False, True):
-        u = register(fixed, moving, changed(SYMMETRIC, symmetric=symmetric)).displacement
+    for both in (False, True):
+        u = register(fixed, moving, changed(SYMMETRIC, symmetric=both)).displacement
         errors.append(float((u - truth).square().sum(1).sqrt()[inside].mean()))
     assert errors[1] < 1.2 * errors[0] + 0.02
 
