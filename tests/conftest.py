@@ -15,8 +15,8 @@ from torchdeform.core.diagnostics import diagnose
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image, resample
 from torchdeform.core.warp import invert
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.evidence import Evidence
-from torchdeform.registration.problem import Annotations
 from torchdeform.registration.result import Callback, LevelRecord, Progress, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
 

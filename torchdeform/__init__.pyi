@@ -49,11 +49,11 @@ from .metrics.evaluation import Evaluation, Measures, dice, hausdorff
 from .pipeline.config import load_settings
 from .registration.affine.align import Alignment, align
 from .registration.affine.settings import AlignmentSettings
+from .registration.annotations import Annotations
 from .registration.deformable import register
 from .registration.discrete import discrete_start
 from .registration.evidence import Evidence
 from .registration.keypoints import Keypoints, keypoint_start
-from .registration.problem import Annotations
 from .registration.result import RegistrationResult
 from .registration.settings import (
     DiscreteSettings,

@@ -16,7 +16,7 @@ import torchdeform as td
 from torchdeform.core.image import background, luminance
 from torchdeform.io.images import read_labels, read_optional
 from torchdeform.io.points import matched, read_points
-from torchdeform.registration.problem import Annotations
+from torchdeform.registration.annotations import Annotations
 
 GOOD_PAIR = "good pair"
 _Part = TypeVar("_Part")

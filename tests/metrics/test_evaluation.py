@@ -23,7 +23,7 @@ from torchdeform.metrics.evaluation import (
     hausdorff,
     landmark_distances,
 )
-from torchdeform.registration.problem import Annotations
+from torchdeform.registration.annotations import Annotations
 
 
 def surface_by_counting(region: Tensor) -> list[tuple[int, ...]]:

@@ -115,6 +115,10 @@ def test_features_of_a_program_and_of_files_are_the_same(folder, capsys):
         assert not (folder / "none").exists()
     assert torchdeform(["check", "fixed.nrrd", "moving.nrrd", *files[:3], "fixed.nrrd"]) == 2
     assert "features of both images must be the same channels" in capsys.readouterr().out
+    flat = read_image(folder / "moving_features.nrrd")
+    write_image(replace(flat, data=torch.ones_like(flat.data)), folder / "flat.nrrd")
+    assert torchdeform(["check", "fixed.nrrd", "moving.nrrd", *files[:3], "flat.nrrd"]) == 2
+    assert "flat.nrrd is constant, so there is nothing to compare" in capsys.readouterr().out
     save_script(CONVOLUTIONS[5 - dim](1, 2, 1), folder / "other.ts")
     assert main([*pair, "--set", "features=other.ts", "--out", "none"]) == 2
     assert "other.ts" in capsys.readouterr().err

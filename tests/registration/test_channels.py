@@ -20,10 +20,11 @@ from torchdeform.errors import InputError
 from torchdeform.metrics.evaluation import dice
 from torchdeform.metrics.mind import mind_ssc
 from torchdeform.registration import channels as made
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.channels import count_features, run_program, with_channels
 from torchdeform.registration.deformable import register
 from torchdeform.registration.objective import forward_objective
-from torchdeform.registration.problem import Annotations, Channels, RegistrationProblem, moved
+from torchdeform.registration.problem import Channels, RegistrationProblem, moved
 from torchdeform.registration.symmetric import symmetric_objective
 
 QUICK = settings_of(steps=(20, 15, 10), window=7, align="none", start="identity")
@@ -70,10 +71,11 @@ def test_pooling_falls_together_in_tiles(monkeypatch):
 
 def test_unit_vectors_are_compared_by_their_angle():
     """A hand-made pair of 2 channels: (3, 0) against (0, 5) is 90°, against (1, 0) 0°, against (−2, 0) 180°."""
-    fixed = torch.tensor([3.0, 0.0]).view(1, 2, 1, 1).expand(1, 2, 6, 6)
     grid, image = Grid((6, 6)), blobs((6, 6))
+    lengths = 1 + image.abs()  # which do not count
+    fixed = lengths * torch.tensor([3.0, 0.0]).view(1, 2, 1, 1)
     for vector, value in (((0.0, 5.0), -1.0), ((1.0, 0.0), 0.0), ((-2.0, 0.0), -2.0)):
-        moving = torch.tensor(vector).view(1, 2, 1, 1).expand(1, 2, 6, 6)
+        moving = lengths.flip(2) * torch.tensor(vector).view(1, 2, 1, 1)
         problem = RegistrationProblem(grid, image, image, features=(fixed, moving))
         settings = settings_of(features="files").decided()
         objective = forward_objective(with_channels(problem, settings), grid, settings)
@@ -296,6 +298,7 @@ def test_what_programs_do_wrong_is_said_in_a_sentence():
         (lambda x: 3, "returns int"),
         (lambda x: x * math.nan, "NaN or infinite"),
         (lambda x: x[:, :0], "with channels"),
+        (torch.fft.fft2, "returns complex numbers"),
         (network(2, inputs=3), "fails on an image of 1 channel and 2 axes of size 44×40"),
         (network(3), "fails on|must return"),
     ):
@@ -306,6 +309,24 @@ def test_what_programs_do_wrong_is_said_in_a_sentence():
     sizes = iter((2, 3))
     with pytest.raises(InputError, match="2 channels for one image or tile and 3 for another"):
         run_program(lambda x: x.repeat(1, next(sizes), 1, 1), torch.cat([image, image]), "net")
+
+
+def test_features_without_contrast_are_refused():
+    image, flat = blobs((40, 44)), torch.ones(1, 2, 40, 44)
+    for how, given, problem in (
+        ({"features": lambda x: 0 * x}, None, "those of <lambda> are the same in every voxel of the fixed image"),
+        ({"features": {"intensities": 1.0, torch.ones_like: 1.0}}, None, "those of ones_like are the same"),
+        ({}, Annotations(fixed_features=image.repeat(1, 2, 1, 1), moving_features=flat), "those of files .* moving"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            register(image, image, changed(QUICK, **how), annotations=given)
+
+
+def test_a_program_may_write_into_what_it_gets():
+    image = blobs((40, 44))
+    kept = image.clone()
+    run_program(lambda x: x.mul_(0), image, "net")
+    torch.testing.assert_close(image, kept)
 
 
 def test_settings_and_what_is_given_must_go_together():

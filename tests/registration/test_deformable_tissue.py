@@ -15,8 +15,8 @@ from torchdeform.core.image import Image
 from torchdeform.core.resampling import restrict
 from torchdeform.core.warp import warp
 from torchdeform.errors import InputError
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.deformable import register, resample_result
-from torchdeform.registration.problem import Annotations
 
 QUICK = settings_of(steps=(20, 15, 8), window=7)
 

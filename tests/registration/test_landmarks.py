@@ -8,9 +8,9 @@ from torch import Tensor
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.warp import sample, warp
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.deformable import register
 from torchdeform.registration.landmarks import ForwardLandmarks, scatter_points
-from torchdeform.registration.problem import Annotations
 
 QUICK = settings_of(steps=(30, 20, 10), weight_div=1.0, length_scale=6.0, window=7, align="none")
 

@@ -17,9 +17,10 @@ from torchdeform.core.grid import Grid
 from torchdeform.core.resampling import coarsened
 from torchdeform.core.warp import warp
 from torchdeform.registration import optimise as levels
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.deformable import register
 from torchdeform.registration.objective import Objective, forward_objective
-from torchdeform.registration.problem import Annotations, RegistrationProblem
+from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.tissue import Tissue
 from torchdeform.registration.velocity import VelocityMetric
 

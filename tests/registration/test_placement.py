@@ -16,8 +16,9 @@ from torchdeform.core.warp import warp
 from torchdeform.metrics.correlation import window_mean
 from torchdeform.metrics.similarity import measure_name, similarity_weights
 from torchdeform.registration.affine.align import Alignment
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.placement import choose, place, sign_agreement
-from torchdeform.registration.problem import Annotations, RegistrationProblem
+from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.settings import RegistrationSettings
 
 SETTINGS = RegistrationSettings()

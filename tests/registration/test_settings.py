@@ -107,6 +107,8 @@ def test_features_are_names_files_programs_or_several_with_weights():
     assert several.maximised == "lncc + features + labels"
     for wrong, problem in (
         ({"features": 3}, "features must be mind, a file of a program"),
+        ({"features": ["mind", "net.ts"]}, r"several with their weights as .*, got \['mind', 'net.ts'\]"),
+        ({"features": ("mind", ["net.ts"])}, "features must be mind, a file of a program"),
         ({"features": ""}, "features must be mind, a file of a program"),
         ({"features": {"mind": 0.0}}, "features: the weight of mind must be a positive"),
         ({"features": {"intensities": 1.0}}, "features: intensities alone"),

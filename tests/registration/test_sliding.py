@@ -15,8 +15,8 @@ from torchdeform.core.image import Image
 from torchdeform.core.warp import sample
 from torchdeform.errors import InputError
 from torchdeform.metrics.base import Similarity
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.deformable import register
-from torchdeform.registration.problem import Annotations
 from torchdeform.registration.sliding import Gliding, _OfAllSides, join
 
 QUICK = settings_of(steps=(30, 24, 16), window=7)

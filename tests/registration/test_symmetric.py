@@ -14,9 +14,10 @@ from torchdeform.core.transform import Affine, Transform
 from torchdeform.core.warp import compose, max_voxels, voxels, warp
 from torchdeform.errors import InputError
 from torchdeform.registration import symmetric as module
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.deformable import register
 from torchdeform.registration.optimise import optimise_levels
-from torchdeform.registration.problem import Annotations, moved
+from torchdeform.registration.problem import moved
 from torchdeform.registration.symmetric import common_axes, midspace_frame, root
 
 SYMMETRIC = settings_of(steps=(30, 20, 10), step_length=0.5, length_scale=6.0, window=7, symmetric=True, align="none")
@@ -84,8 +85,8 @@ def test_a_known_map_is_found_as_well_as_without(shape):
     fixed = warp(moving, truth, grid)
     inside = (..., *[slice(4, -4)] * grid.dim)
     errors = []
-    for symmetric in (False, True):
-        u = register(fixed, moving, changed(SYMMETRIC, symmetric=symmetric)).displacement
+    for both in (False, True):
+        u = register(fixed, moving, changed(SYMMETRIC, symmetric=both)).displacement
         errors.append(float((u - truth).square().sum(1).sqrt()[inside].mean()))
     assert errors[1] < 1.2 * errors[0] + 0.02
 

@@ -13,7 +13,7 @@ from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine
 from torchdeform.metrics.evaluation import Evaluation, Measures
 from torchdeform.registration.affine.align import Alignment
-from torchdeform.registration.problem import Annotations
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.tissue import TissueFit, TissueOutcome
 from torchdeform.report.record import describe, repeat_command
 from torchdeform.report.report_data import ReportData, make_report_data

@@ -7,7 +7,7 @@ import torch
 
 from torchdeform.core.transform import Affine
 from torchdeform.metrics.evaluation import evaluate_images
-from torchdeform.registration.problem import Annotations
+from torchdeform.registration.annotations import Annotations
 from torchdeform.report.landmarks import landmarks_of
 
 

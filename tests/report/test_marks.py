@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchdeform.registration.problem import Annotations
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report import make_report_data
 from torchdeform.report.marks import landmark_colours

@@ -8,7 +8,7 @@ import torch
 
 from torchdeform.core.grid import Grid
 from torchdeform.core.image import Image
-from torchdeform.registration.problem import Annotations
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.result import RegistrationResult
 from torchdeform.report.landmarks import landmarks_of
 from torchdeform.report.places import chosen_slices, span, worst_place

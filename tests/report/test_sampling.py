@@ -8,7 +8,7 @@ import torch
 
 from torchdeform.core.image import resample
 from torchdeform.core.transform import Affine, Transform
-from torchdeform.registration.problem import Annotations
+from torchdeform.registration.annotations import Annotations
 from torchdeform.report.planes import planes_of
 from torchdeform.report.sampling import FIXED, ORIGINAL, WARPED, PairSampler, grey, quantiles
 

@@ -32,8 +32,8 @@ from torchdeform.pipeline.config import load_settings
 from torchdeform.pipeline.preflight import ERROR, Finding, Report, preflight
 from torchdeform.pipeline.tissue import check_tissue
 from torchdeform.registration.affine.settings import ALIGNMENTS
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.placement import place
-from torchdeform.registration.problem import Annotations
 from torchdeform.report.figures import write_overlay
 
 Fixed = Annotated[

@@ -20,8 +20,8 @@ from torchdeform.io.gate import read_text, require_file, require_name
 from torchdeform.io.transforms import write_voxel_displacement
 from torchdeform.pipeline.register import Outcome, PairFiles, register_files
 from torchdeform.pipeline.tissue import contradiction as unexplained_tissue
+from torchdeform.registration.annotations import PAIRED
 from torchdeform.registration.channels import contradiction
-from torchdeform.registration.problem import PAIRED
 from torchdeform.registration.result import Callback
 from torchdeform.registration.settings import RegistrationSettings
 

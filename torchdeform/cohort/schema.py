@@ -33,7 +33,7 @@ from torchdeform.cohort.settings import (
 from torchdeform.errors import InputError, nearest_name, require_choice, shown
 from torchdeform.io.texts import Lines, to_yaml
 from torchdeform.pipeline.config import load_settings, merged_settings, preset_names, read_yaml, read_yaml_lines
-from torchdeform.registration.problem import PAIRED
+from torchdeform.registration.annotations import PAIRED
 from torchdeform.registration.settings import SHORT_FORMS, RegistrationSettings
 
 # Companions of an image by their keys here, with their names in a pair.

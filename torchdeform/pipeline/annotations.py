@@ -9,7 +9,7 @@ from torch import Tensor
 from torchdeform.core.image import Image, overlap, require_same_place
 from torchdeform.errors import InputError
 from torchdeform.pipeline.preflight import ERROR, WARNING, Finding
-from torchdeform.registration.problem import Annotations
+from torchdeform.registration.annotations import Annotations
 
 _MARGIN = 3.0  # voxels by which a landmark may lie outside without a word
 _PIXELS = "px"
@@ -79,7 +79,7 @@ def check_labels(image: Image, labels: Image, what: str = "labels") -> Iterator[
 
 
 def check_features(images: tuple[Image, Image], features: tuple[Image | None, Image | None]) -> Iterator[Finding]:
-    """Yield what looks wrong with channels to compare: those of one image only, unlike ones, those in another place."""
+    """Yield what looks wrong with channels to compare: of one image only, unlike, in another place, constant."""
     first, second = features
     if first is None and second is None:
         return
@@ -91,6 +91,10 @@ def check_features(images: tuple[Image, Image], features: tuple[Image | None, Im
     for image, channels in zip(images, features, strict=True):
         if channels is not None:
             yield from check_labels(image, channels, "features")
+            if bool((channels.data == channels.data[:, :, *[slice(1)] * channels.grid.dim]).all()):
+                yield Finding(
+                    ERROR, f"{channels.name} is constant, so there is nothing to compare; give other features"
+                )
 
 
 def _of_another_size(image: Image, labels: Image, apart: str, what: str) -> str:

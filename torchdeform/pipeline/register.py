@@ -28,9 +28,9 @@ from torchdeform.pipeline.memory import Channels, advice, fitting_grid, footprin
 from torchdeform.pipeline.preflight import WARNING, Finding, Report, preflight
 from torchdeform.pipeline.tissue import check_tissue
 from torchdeform.pipeline.tissue import contradiction as unexplained_tissue
+from torchdeform.registration.annotations import PAIRED, Annotations
 from torchdeform.registration.channels import contradiction, count_features, settled
 from torchdeform.registration.deformable import resample_result
-from torchdeform.registration.problem import PAIRED, Annotations
 from torchdeform.registration.result import Callback, RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.figures import write_overview

@@ -20,7 +20,8 @@ from torchdeform.metrics.base import mean, relative_weight, weighted
 from torchdeform.metrics.evaluation import common_labels
 from torchdeform.metrics.mind import mind_ssc, neighbour_pairs
 from torchdeform.metrics.similarity import needs_common_scale, similarity_weights
-from torchdeform.registration.problem import Annotations, Channels, RegistrationProblem
+from torchdeform.registration.annotations import Annotations
+from torchdeform.registration.problem import Channels, RegistrationProblem
 from torchdeform.registration.settings import FILES, INTENSITIES, MIND, RegistrationSettings
 
 # Images are taken through a program in tiles of this width, which begin at multiples of _STEP so that what a network
@@ -100,6 +101,7 @@ def _of_features(problem: RegistrationProblem, settings: RegistrationSettings) -
         if source == INTENSITIES:
             continue
         made = _made(source, problem)
+        _require_contrast(made, name_of(source))
         for measure in measures:
             yield Channels(
                 problem.grid, *_prepared(made, measure, source, problem), measure, weights[source, measure] / first
@@ -117,6 +119,16 @@ def _made(source: Any, problem: RegistrationProblem) -> tuple[Tensor, Tensor]:
         return mind_ssc(fixed), mind_ssc(moving)
     program = program_of(source, fixed.device)
     return run_program(program, fixed, name_of(source)), run_program(program, moving, name_of(source))
+
+
+def _require_contrast(features: tuple[Tensor, Tensor], name: str) -> None:
+    for side, values in zip(("fixed", "moving"), features, strict=True):
+        varies = values.flatten(2).amax(2) > values.flatten(2).amin(2)
+        if not bool(varies.any(1).all()):
+            raise InputError(
+                f"features: those of {name} are the same in every voxel of the {side} image, so there is nothing to "
+                "compare; choose others"
+            )
 
 
 def _filled(fields: list[Tensor], problem: RegistrationProblem) -> tuple[Tensor, Tensor]:
@@ -219,7 +231,7 @@ def _called(program: Callable[[Tensor], Tensor], tile: Tensor, name: str) -> Ten
     what = f"an image of {tile.shape[1]} channel{'s' * (tile.shape[1] > 1)} and {tile.dim() - 2} axes"
     try:
         with quiet():
-            values = program(tile.to(weights.device, torch.float32))
+            values = program(tile.to(weights.device, torch.float32, copy=True))  # which it may write into
     except Exception as error:
         if isinstance(error, MemoryError | torch.OutOfMemoryError) or "allocate" in str(error):
             raise
@@ -234,6 +246,8 @@ def _called(program: Callable[[Tensor], Tensor], tile: Tensor, name: str) -> Ten
         raise InputError(f"features: {name} must return {wanted} for {what} of that size, but returns {got}")
     if len(values) != 1 or values.shape[1] == 0:
         raise InputError(f"features: {name} must return one image with channels, but returns {tuple(values.shape)}")
+    if values.is_complex():
+        raise InputError(f"features: {name} returns complex numbers; return their parts as channels of their own")
     if not bool(values.isfinite().all()):
         raise InputError(f"features: {name} returns values that are NaN or infinite; choose another program")
     return values

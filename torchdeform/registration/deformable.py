@@ -20,6 +20,7 @@ from torchdeform.metrics.evaluation import evaluate_images, evaluate_tensors
 from torchdeform.metrics.similarity import mark
 from torchdeform.registration.absence import Regions, let_go, moved_with
 from torchdeform.registration.agreement import disagreement
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.channels import count_features, settled, with_channels
 from torchdeform.registration.discrete import discrete_start
 from torchdeform.registration.evidence import gather_evidence, to_compare, with_labels
@@ -28,7 +29,6 @@ from torchdeform.registration.objective import common_mask, forward_objective
 from torchdeform.registration.optimise import best_map, held_still, optimise_levels
 from torchdeform.registration.placement import Placement, place, problem_at
 from torchdeform.registration.problem import (
-    Annotations,
     PlacedImage,
     RegistrationProblem,
     moved,

@@ -14,8 +14,9 @@ from torchdeform.metrics.base import weighted
 from torchdeform.metrics.correlation import LNCC_FLOOR, contrast, local_contrast, window_mean, window_moments
 from torchdeform.metrics.similarity import mark, measure_name
 from torchdeform.registration.affine.align import Alignment, align
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.keypoints import common_shift
-from torchdeform.registration.problem import Annotations, PlacedImage, RegistrationProblem, placed_images, resample_pair
+from torchdeform.registration.problem import PlacedImage, RegistrationProblem, placed_images, resample_pair
 from torchdeform.registration.settings import RegistrationSettings
 
 # Kinds of tissue that only a rigid alignment leaves as they are, and the alignments that it then takes the place of.

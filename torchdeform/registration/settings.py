@@ -1,7 +1,7 @@
 """Settings of a registration, nested by subject: typed, frozen, checked when made."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -369,10 +369,12 @@ class RegistrationSettings:
     def _check_features(self) -> None:
         if isinstance(self.features, Mapping):
             object.__setattr__(self, "features", dict(self.features))
-        for name in self.sources:
-            if not callable(name) and not (isinstance(name, str | Path) and str(name)):
+        given = self.features if isinstance(self.features, Mapping) else [self.features]
+        for name in [] if self.features is None else given:
+            if not isinstance(name, Hashable) or not (callable(name) or (isinstance(name, str | Path) and str(name))):
                 raise InputError(
-                    f"features must be {MIND}, a file of a program, or several with their weights, got {shown(name)}"
+                    f"features must be {MIND}, a file of a program, or several with their weights as "
+                    f"{{{MIND}: 1, net.ts: 0.5}}, got {shown(name)}"
                 )
         if self.sources and self.sources.keys() <= {INTENSITIES}:
             raise InputError("features: intensities alone are what is compared without it; leave it out, or add others")

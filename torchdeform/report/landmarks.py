@@ -9,7 +9,7 @@ from torchdeform.core.image import Image
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import sample
 from torchdeform.metrics.evaluation import landmark_distances
-from torchdeform.registration.problem import Annotations
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.result import RegistrationResult
 from torchdeform.report.sampling import MOVING, ORIGINAL, WARPED
 

@@ -12,7 +12,7 @@ from torchdeform.core.grid import Grid, over_slabs
 from torchdeform.core.image import Image
 from torchdeform.core.warp import sample, voxels
 from torchdeform.metrics.similarity import similarity_weights
-from torchdeform.registration.problem import Annotations
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.result import RegistrationResult
 from torchdeform.report.landmarks import landmarks_of
 from torchdeform.report.marks import Known, Marks, marks_of

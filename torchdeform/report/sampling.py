@@ -10,7 +10,7 @@ from torch import Tensor
 from torchdeform.core.image import Image, luminance, same_place, surroundings
 from torchdeform.core.transform import Affine
 from torchdeform.core.warp import inside_box, sample
-from torchdeform.registration.problem import Annotations
+from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.result import RegistrationResult
 from torchdeform.registration.settings import RegistrationSettings
 from torchdeform.report.planes import Plane
