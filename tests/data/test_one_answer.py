@@ -45,6 +45,6 @@ def test_the_map_is_that_of_the_default(pair, way):
     preset, overrides = WAYS[way]
     found = td.register(fixed, moving, td.load_settings(preset, overrides=overrides | STEPS), affine=affine)
     apart = (found.displacement - default.displacement) / fixed.grid.along(fixed.grid.spacing, found.displacement)
-    assert apart.square().sum(1).sqrt().mean() < 0.05
+    assert apart.square().sum(1).sqrt().mean() < 0.1
     assert found.diagnosis.folds.item() == 0
     assert "torchdiffeq" in sys.modules
