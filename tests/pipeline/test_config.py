@@ -122,6 +122,7 @@ def test_malformed_overrides(text):
         ("- window", "must hold 'key: value' lines"),
         ("5: window", "settings.yaml: there is no setting '5'"),
         ("5.5: window", "at line 1: the key 5.5 is no text; write it in quotes"),
+        ("keypoints: {reach: 5}", r"settings.yaml: keypoints.reach = 5: Input should be a list, such as \[40, 20\]"),
         ("similarity: {lncc: x}", r"settings.yaml: similarity.measure.lncc = 'x': Input should be a valid number"),
         ("tissues: rigid", r"settings.yaml: tissues gives each label its kind, such as \{1: rigid\}, got 'rigid'"),
         ("tissues:", "settings.yaml: tissues gives each label its kind, .*, got None"),

@@ -241,8 +241,10 @@ def test_images_far_apart_in_the_world_are_brought_together_without_alignment():
     torch.testing.assert_close(found.affine.offset, torch.tensor([30.0, -18.0]).double(), rtol=0, atol=2.5)
     inner = (..., slice(8, -8), slice(8, -8))
     assert float((found.warped - fixed.data)[inner].abs().mean()) < 0.05
+    assert found.similarity_before.item() < 0.5 < 0.9 < found.similarity_aligned.item()
     near = td.register(fixed, fixed, td.RegistrationSettings(align="none", start="keypoints"))
     assert near.affine is None
+    assert near.similarity_aligned is None
 
 
 def test_axes_that_are_held_stay_and_symmetric_mode_starts_as_well():

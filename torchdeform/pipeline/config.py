@@ -236,7 +236,7 @@ def _validate(values: dict[str, Any], sources: Mapping[str, str]) -> Registratio
         errors = error.errors(include_url=False)
     # Of a choice of types, the one that goes farthest is meant.
     first = max((one for one in errors if one["loc"][:2] == errors[0]["loc"][:2]), key=lambda one: len(one["loc"]))
-    problem = first["msg"].removeprefix("Value error, ")
+    problem = first["msg"].removeprefix("Value error, ").replace("a valid tuple", "a list, such as [40, 20]")
     if not first["loc"]:
         named = re.match(r"\w*", problem)
         raise InputError(f"{sources.get(named[0] if named else '', 'settings')}: {problem}")

@@ -215,7 +215,7 @@ def _register_images(
         absent=moved_with(regions, found.u, fixed.grid),
         choice=placed.choice,
         similarity_before=result.similarity_before if placed.unaligned is None else placed.unaligned,
-        similarity_aligned=result.similarity_before if alignment else None,
+        similarity_aligned=result.similarity_before if alignment or placed.unaligned is not None else None,
         evaluation=evaluate_images(fixed, affine, found.u, labels=annotations.labels, points=annotations.points),
         seconds=({"align": alignment.seconds} if alignment else {}) | result.seconds,
     )

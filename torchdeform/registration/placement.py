@@ -46,7 +46,7 @@ class Placement:
         affine: map of the world from the fixed to the moving image; None for the identity.
         alignment: how it was found; None where it was given, or none was asked for.
         unaligned: `mark` of both images where the files place them ``(1,)``; None where they do not overlap, or where
-            nothing was aligned.
+            nothing was aligned or shifted.
         choice: a sentence on the similarity that was chosen; None where it was given.
     """
 
@@ -83,14 +83,16 @@ def place(
     if affine is None and settings.align.kind != "none":
         alignment = _align(fixed, moving, settings, annotations)
         affine = alignment.affine
-    problem = problem_at(*both, affine).scaled(settings)
+    problem, shift = problem_at(*both, affine).scaled(settings), None
     if affine is None and settings.start == "keypoints":
-        affine = _shift(both[0].image, problem, settings)
+        affine = shift = _shift(both[0].image, problem, settings)
         problem = problem if affine is None else problem_at(*both, affine).scaled(settings)
     settings, choice = choose(problem, settings)
-    if alignment is None:
+    if alignment is None and shift is None:
         return Placement(settings, affine, choice=choice)
     unaligned, merit = _marked_as_they_are(*both, settings) if overlap(fixed, moving) > 0 else (None, None)
+    if alignment is None:
+        return Placement(settings, affine, unaligned=unaligned, choice=choice)
     if merit is not None and not bool(_marked(problem, settings)[1] > merit + _GAIN):
         kept = replace(alignment, affine=Affine.identity(fixed.grid.dim), start="geometry")
         alignment = replace(kept, similarity_after=alignment.similarity_before)

@@ -37,11 +37,12 @@ class SimilaritySettings:
 
     Args:
         measure: ``auto`` looks at two `Image`s and takes ``lncc`` where they have one contrast and ``mind`` where they
-            do not (always ``lncc`` for tensors, whose batches may differ). For images of one contrast: ``lncc``
-            (squared local normalised cross-correlation, whatever the brightness), ``ncc`` (the correlation of whole
-            images), ``ssd`` (mean squared difference, for images on the same intensity scale). For images of different
-            contrast: ``mind`` (self-similarity of patches), ``mi`` and ``nmi`` (mutual information, normalised),
-            ``ngf`` (directions of the gradients). Or several of them with positive weights, as ``{lncc: 1, mi: 0.5}``.
+            do not, with ``ngf`` beside it the less noise there is (always ``lncc`` for tensors, whose batches may
+            differ). For images of one contrast: ``lncc`` (squared local normalised cross-correlation, whatever the
+            brightness), ``ncc`` (the correlation of whole images), ``ssd`` (mean squared difference, for images on the
+            same intensity scale). For images of different contrast: ``mind`` (self-similarity of patches), ``mi`` and
+            ``nmi`` (mutual information, normalised), ``ngf`` (directions of the gradients). Or several of them with
+            positive weights, as ``{lncc: 1, mi: 0.5}``.
         window: width of the LNCC window in voxels, odd.
 
     Raises:
@@ -108,11 +109,12 @@ class OptimiserSettings:
         steps: steps at most on each pyramid level, coarse to fine; its length is the number of levels (a level that
             would leave fewer than 16 nodes on every axis is dropped).
         step_length: longest move in one step, in voxels of the level's images; falls linearly to a tenth of this over a
-            level, and to 0.85 of itself with every step that made the images less similar.
+            level, and to 0.85 of itself with every step after which the images are no more similar than before.
         limit: moves longer than this many typical ones, √(Σ|v|⁴ / Σ|v|²), are cut to that, which is then the longest
-            move; ``null``: none is cut.
-        evenness: the force at a node is divided by its strength around it and this share of the typical strength: small
-            moves what is weak as far as what is strong; ``null``: the force is taken as it is.
+            move; ``null``: none is cut. Not where tissue is given, as what is rigid turns as a whole.
+        evenness: the force at a node is divided by its strength around it and this share of the typical strength: the
+            smaller, the farther what is weak moves beside what is strong; ``null``, and where tissue is given: the
+            force is taken as it is.
         momentum: at least 0 and below 1; the direction of a step is Σ_k momentumᵏ v_k of the velocities so far, the
             newest being v_0. What they agree on is reached sooner, what they take back from each other cancels.
         tolerance: a level stops when 5 steps raised the best similarity by less than this share of its rise so far.

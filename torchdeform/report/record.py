@@ -93,7 +93,7 @@ def _alignment(result: RegistrationResult) -> dict[str, object]:
         return {"kind": "none"}
     found = result.alignment
     return {
-        "kind": result.settings.align.kind if found else "keypoints" if result.keypoints else "given",
+        "kind": result.settings.align.kind if found else "given" if result.similarity_aligned is None else "keypoints",
         "matrix": result.affine.matrix.tolist(),
         "offset": result.affine.offset.tolist(),
         "start": found and found.start,
