@@ -78,6 +78,7 @@ class DeformableRegistration(nn.Module):
             steps=self.steps,
             elasticity=elasticity_of(self.settings.metric, len(u)),
             keep_best=False,
+            voxel=min(self.grid.spacing),
         )
         return optimise_level(level, u, run=partial(checkpoint, use_reentrant=False)).u
 

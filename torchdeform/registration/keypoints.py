@@ -28,6 +28,7 @@ from torchdeform.registration.matching import (
     items_of,
     require_pair,
 )
+from torchdeform.registration.problem import thin_axes
 from torchdeform.registration.settings import KeypointSettings
 from torchdeform.registration.velocity import VelocityMetric
 from torchdeform.solvers.cg import conjugate_gradient
@@ -211,15 +212,20 @@ def distinctiveness(image: Tensor, grid: Grid, sigma: float = 1.0) -> Tensor:
         image: ``(B, C, *S)``.
         grid: its grid.
         sigma: standard deviation of the Gaussian G in voxels.
+
+    Notes:
+        Axes of a few nodes, along which nothing is moved, do not count where two others are left.
     """
-    slopes = [derivative(image, grid, a) * min(grid.spacing) for a in range(grid.dim)]
-    pairs = {(i, j): (slopes[i] * slopes[j]).sum(1, keepdim=True) for i in range(grid.dim) for j in range(i + 1)}
+    axes = [a for a in range(grid.dim) if a not in thin_axes(grid)]
+    axes = axes if len(axes) > 1 else list(range(grid.dim))
+    slopes, count = [derivative(image, grid, a) * min(grid.spacing) for a in axes], len(axes)
+    pairs = {(i, j): (slopes[i] * slopes[j]).sum(1, keepdim=True) for i in range(count) for j in range(i + 1)}
     smooth = {pair: gaussian(product, sigma)[:, 0] for pair, product in pairs.items()}
-    rows = [torch.stack([smooth[max(i, j), min(i, j)] for j in range(grid.dim)], 1) for i in range(grid.dim)]
+    rows = [torch.stack([smooth[max(i, j), min(i, j)] for j in range(count)], 1) for i in range(count)]
     tensor = torch.stack(rows, 1)
     rounding = (_ROUNDING * torch.finfo(image.dtype).eps * largest(image)).square()
     tensor = tensor / per_item(largest(tensor).maximum(rounding).clamp(min=torch.finfo(image.dtype).tiny), tensor)
-    minors = torch.stack([cofactors(tensor)[:, a, a] for a in range(grid.dim)]).sum(0).unsqueeze(1)
+    minors = torch.stack([cofactors(tensor)[:, a, a] for a in range(count)]).sum(0).unsqueeze(1)
     return (determinant(tensor) / minors.clamp(min=_FLAT)).clamp(min=0)
 
 

@@ -77,6 +77,7 @@ class Level:
         held: axes along which nothing is moved, from 0.
         tissue: what the fixed image is made of, on the grid of the map.
         hold: makes maps rigid again where the tissue is.
+        voxel: smallest spacing of the images at full detail.
     """
 
     objective: Objective
@@ -91,6 +92,7 @@ class Level:
     held: tuple[int, ...] = ()
     tissue: Tissue | None = None
     hold: RigidHold | None = None
+    voxel: float = 1.0
 
     @property
     def grid(self) -> Grid:
@@ -101,11 +103,6 @@ class Level:
     def shape(self) -> tuple[int, ...]:
         """The grid of the level's images."""
         return self.objective.similarity.grid.shape
-
-    @property
-    def voxel(self) -> float:
-        """Smallest spacing of the images on the finest level, but for the rounding of their nodes."""
-        return min(self.objective.similarity.grid.spacing) / 2 ** (self.levels - 1 - self.index)
 
     def force(self, slope: Tensor, warped: Tensor) -> Tensor:
         """Return the `image_force` on the grid of the map."""
@@ -169,6 +166,7 @@ def optimise_levels(
     for index, grid in enumerate(grids):
         began = perf_counter()
         level = make_level(problem.on(grid), settings, objective, index, len(grids))
+        level = replace(level, voxel=min(problem.grid.spacing))
         u = level.zero if u is None else repair_folds(prolong(u, level.grid), level.grid)
         with limit_threads(len(u), grid):
             state = optimise_level(level, u, callback)
@@ -204,6 +202,7 @@ def make_level(
         held=problem.held,
         tissue=tissue,
         hold=None if tissue is None else tissue.hold(grid),
+        voxel=min(problem.grid.spacing),
     )
 
 

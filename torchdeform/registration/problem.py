@@ -142,7 +142,7 @@ def problem_of_tensors(fixed: Tensor, moving: Tensor, grid: Grid, annotations: A
     images = [image if mask is None else fill(image, mask) for image, mask in zip((fixed, moving), masks, strict=True)]
     points = [None if p is None else p.to(fixed) for p in (annotations.fixed_points, annotations.moving_points)]
     features, labels = (_for_items(pair, fixed) for pair in (annotations.features, annotations.labels))
-    held = _thin_axes(grid)
+    held = thin_axes(grid)
     return RegistrationProblem(grid, *images, *masks, *points, held=held, features=features, labels=labels)
 
 
@@ -230,7 +230,7 @@ def resample_pair(fixed: PlacedImage, moving: PlacedImage, frame: Image) -> Regi
     points = [None if s.points is None else frame.to_grid(s.points).to(like) for s in (fixed, moving)]
     weights = [None if mask is None else mask.to(like) for mask in masks]
     across = [axis for part in (fixed, moving) if (axis := _across(part.image, frame)) is not None]
-    held = tuple(sorted({*_thin_axes(frame.grid), *across}))
+    held = tuple(sorted({*thin_axes(frame.grid), *across}))
     features, labels = (_pair_on(frame, fixed, moving, name) for name in ("features", "labels"))
 
     def seen(thickness: float) -> RegistrationProblem:
@@ -263,7 +263,7 @@ def _seen(fixed: Image, moving: Image, frame: Image) -> tuple[Tensor, Tensor]:
     return _through(replace(frame, data=images[0]), moving), _through(replace(frame, data=images[1]), fixed)
 
 
-def _thin_axes(grid: Grid) -> tuple[int, ...]:
+def thin_axes(grid: Grid) -> tuple[int, ...]:
     """Return the axes with few nodes; none where all have few."""
     thin = tuple(axis for axis, nodes in enumerate(grid.shape) if nodes < MIN_NODES)
     return thin if len(thin) < grid.dim else ()
