@@ -250,6 +250,15 @@ def test_invert_is_honest_about_folds():
     assert torch.equal(invert(u[:1], grid), w[:1])
 
 
+@pytest.mark.parametrize("shape", [(2, 14, 16), (14, 16, 2), (2, 16)])
+def test_folds_of_what_is_thin_have_a_finite_inverse_too(shape):
+    """Nodes that Newton's method lost begin again from their neighbours, of which there are two along an axis."""
+    grid = Grid(shape)
+    w, error = invert(2.0 * random(1, grid.dim, *shape).float(), grid, return_error=True)
+    assert error > 0.01
+    assert w.isfinite().all()
+
+
 def test_gradient_of_the_inverse():
     """Against a difference quotient on a smooth map: exact up to the second-order differences that it uses."""
     grid = Grid((65, 65))

@@ -115,7 +115,7 @@ def test_parabolas_go_on_over_faces_and_edges(shape):
     torch.testing.assert_close(continued(smooth.masked_fill(~known, torch.nan), known), smooth)
 
 
-@pytest.mark.parametrize("shape", [(3, 4), (14, 11), (9, 8, 10)])
+@pytest.mark.parametrize("shape", [(3, 4), (14, 11), (9, 8, 10), (2, 9, 8)])
 def test_what_is_far_from_what_is_known_stays_in_its_range(shape):
     field = torch.rand(2, 2, *shape, generator=torch.manual_seed(0))
     known = torch.rand(2, 2, *shape, generator=torch.manual_seed(1)) < 0.05

@@ -230,3 +230,17 @@ def test_elasticity_keeps_a_map_nearer_to_an_affine_one():
     stiff, soft = (register(fixed, moving, changed(QUICK, elasticity=e)) for e in (0.5, 0.0))
     bends = [result.displacement.diff(n=2, dim=-1).abs().mean().item() for result in (stiff, soft)]
     assert bends[0] < 0.7 * bends[1]
+
+
+@pytest.mark.parametrize("spacing", [1e-3, 2.5, 1e3])
+@pytest.mark.parametrize("shape", [(48, 56), (20, 24, 18)])
+def test_the_unit_of_the_spacing_does_not_matter(shape, spacing):
+    """Nor near folds, where a divergence is asked for: MIND bends small images most."""
+    settings = settings_of(steps=(15, 10), similarity="mind", start="identity", align="none")
+    moving, found = blobs(shape, 1), []
+    fixed = warp(moving, bend(Grid(shape), 4.0), Grid(shape))
+    for h in (1.0, spacing):
+        pair = [Image(data, Grid(shape, (h,) * len(shape))) for data in (fixed, moving)]
+        found.append(register(*pair, settings))
+    assert found[0].diagnosis.smallest < settings.folds.soft_determinant
+    torch.testing.assert_close(found[1].displacement / spacing, found[0].displacement, rtol=0, atol=1e-2)

@@ -180,6 +180,14 @@ def test_images_without_texture_or_relation_begin_with_the_identity_and_say_so(s
     assert not bool(u.any())
 
 
+@pytest.mark.parametrize("shape", [(67, 81), (40, 44, 36)])
+@pytest.mark.parametrize("value", [0.1, 0.7, -300.0])
+def test_the_rounding_of_a_constant_image_has_no_corners(shape, value):
+    image = torch.full((1, 1, *shape), value)
+    _, (points,) = keypoint_start(image, 1.3 * image, Grid(shape))
+    assert points.looked_for == 0
+
+
 def test_a_warning_counts_the_items_of_a_batch():
     good, ramp = moved_pair((96, 96)), torch.linspace(0, 1, 96).expand(1, 1, 96, 96)
     fixed, moving = torch.cat([good[0], ramp]), torch.cat([good[1], ramp**2])

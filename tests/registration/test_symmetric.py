@@ -13,7 +13,7 @@ from torchdeform.core.image import Image, resample
 from torchdeform.core.transform import Affine, Transform
 from torchdeform.core.warp import compose, max_voxels, voxels, warp
 from torchdeform.errors import InputError
-from torchdeform.registration import symmetric
+from torchdeform.registration import symmetric as module
 from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.deformable import register
 from torchdeform.registration.optimise import optimise_levels
@@ -43,7 +43,7 @@ def test_swapping_the_images_inverts_the_map(shape, similarity):
 def test_swapping_images_that_have_nothing_in_common_swaps_the_halves_of_the_map(monkeypatch):
     """Both halves, that is: where volumes change up to eight times, joining them on a grid is not exact to a voxel."""
     shape, halves = (64, 64), []
-    monkeypatch.setattr(symmetric, "optimise_levels", lambda *a: halves.append(optimise_levels(*a)) or halves[-1])
+    monkeypatch.setattr(module, "optimise_levels", lambda *a: halves.append(optimise_levels(*a)) or halves[-1])
     there, back = (register(blobs(shape, i), blobs(shape, 3 - i), SYMMETRIC) for i in (1, 2))
     assert there.diagnosis.folds.item() == back.diagnosis.folds.item() == 0
     assert voxels(there.displacement, there.grid).max() > 10  # nothing in common

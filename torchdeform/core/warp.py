@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchdeform.core.derivatives import LEAST_ROWS, cofactors, derivative, determinant, map_jacobian, slab_of
 from torchdeform.core.grid import Grid, on_threads, over_slabs, parts_of, require_float
-from torchdeform.core.resampling import AVERAGE_POOL, Rows, least_rows, prolong
+from torchdeform.core.resampling import Rows, box_sum, least_rows, prolong
 from torchdeform.core.tables import numbers_are_real
 from torchdeform.errors import InputError, require_choice
 
@@ -437,10 +437,8 @@ def _from_nodes(u: Tensor, nodes: Tensor, w: Tensor, grid: Grid) -> Tensor:
 
 def _mean_of_neighbours(w: Tensor, known: Tensor) -> Tensor:
     """Return at each node the mean of w over the known ones among it and its neighbours, or w if there is none."""
-    pool = AVERAGE_POOL[w.shape[1]]
-    share = pool(known.to(w.dtype), 3, stride=1, padding=1)
-    mean = pool(w * known, 3, stride=1, padding=1) / share.clamp(min=torch.finfo(w.dtype).tiny)
-    return torch.where(share > 0, mean, w)
+    count = box_sum(known.to(w), 3)
+    return torch.where(count > 0.5, box_sum(w * known, 3) / count.clamp(min=1), w)
 
 
 def keep_inside(u: Tensor, grid: Grid) -> Tensor:

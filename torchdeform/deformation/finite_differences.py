@@ -23,7 +23,7 @@ from torchdeform.core.derivatives import (
     map_jacobian,
 )
 from torchdeform.core.grid import Grid
-from torchdeform.core.resampling import AVERAGE_POOL
+from torchdeform.core.resampling import box_sum
 from torchdeform.fem.boundary import FIXES
 from torchdeform.solvers.cg import dots
 from torchdeform.solvers.sine_cosine import Kind, Kinds, separable_transform
@@ -204,6 +204,5 @@ def _parabolas(field: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _neighbours(field: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the mean over the known neighbours times their share, and the share."""
-    pool = AVERAGE_POOL[field.dim() - 2]
-    return pool(field * known, 3, stride=1, padding=1), pool(known.to(field.dtype), 3, stride=1, padding=1)
+    """Return the sum over the known neighbours, and how many there are."""
+    return box_sum(field * known, 3), box_sum(known.to(field), 3)

@@ -38,6 +38,9 @@ FEWEST = 8
 # Corners weaker than this share of the strongest edge are noise; what is flat, by the square of that, has none.
 _WEAKEST, _FLAT = 1e-5, 1e-12
 
+# An edge that is weaker than so many of the smallest steps of a type at an image's brightest is one of its rounding.
+_ROUNDING = 2**10
+
 # A level that is searched has so many nodes along its longest axis.
 _LONGEST = 32
 
@@ -214,8 +217,8 @@ def distinctiveness(image: Tensor, grid: Grid, sigma: float = 1.0) -> Tensor:
     smooth = {pair: gaussian(product, sigma)[:, 0] for pair, product in pairs.items()}
     rows = [torch.stack([smooth[max(i, j), min(i, j)] for j in range(grid.dim)], 1) for i in range(grid.dim)]
     tensor = torch.stack(rows, 1)
-    scale = per_item(largest(tensor).clamp(min=torch.finfo(image.dtype).tiny), tensor)
-    tensor = tensor / scale
+    rounding = (_ROUNDING * torch.finfo(image.dtype).eps * largest(image)).square()
+    tensor = tensor / per_item(largest(tensor).maximum(rounding).clamp(min=torch.finfo(image.dtype).tiny), tensor)
     minors = torch.stack([cofactors(tensor)[:, a, a] for a in range(grid.dim)]).sum(0).unsqueeze(1)
     return (determinant(tensor) / minors.clamp(min=_FLAT)).clamp(min=0)
 

@@ -102,6 +102,11 @@ class Level:
         """The grid of the level's images."""
         return self.objective.similarity.grid.shape
 
+    @property
+    def voxel(self) -> float:
+        """Smallest spacing of the images on the finest level, but for the rounding of their nodes."""
+        return min(self.objective.similarity.grid.spacing) / 2 ** (self.levels - 1 - self.index)
+
     def force(self, slope: Tensor, warped: Tensor) -> Tensor:
         """Return the `image_force` on the grid of the map."""
         force = partial(image_force, slope, warped, self.objective.similarity.grid, self.settings.stencil)
@@ -285,7 +290,7 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     scale = settings.points_weight * math.prod(grid.shape) * channels  # to the unit of N ∂S/∂warped
     load = None if points is None else points.load(grid) * scale
     # 3. Least squares: div and curl of the velocity are paid for, nearly folded places ask for divergence.
-    barrier = fold_barrier(state.lowest, settings.folds.soft_determinant)
+    barrier = level.voxel * fold_barrier(state.lowest, settings.folds.soft_determinant)
     force, load = held_still(force, level.held), None if load is None else held_still(load, level.held)
     coupling = objective.coupling
     ascent = level.metric.ascent(force, barrier, load, coupling.together, state.ascent)

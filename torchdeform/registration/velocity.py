@@ -103,7 +103,8 @@ class VelocityMetric:
 
         Args:
             force: force density of the images ``(B, D, *S)``, in any unit; it is scaled to 1 at its strongest.
-            barrier: divergence asked for ``(B, 1, *S)`` where the map is nearly folded, see `fold_barrier`.
+            barrier: divergence asked for ``(B, 1, *S)`` where the map is nearly folded, see `fold_barrier`, times the
+                length of a voxel, so that it weighs the same in any unit.
             points: load of the landmarks ``(B, D, *S)``, in the unit of the force.
             near: a velocity to begin with, see `velocity`.
             together: of sizes ``(B,)``, the largest of those that are scaled together.
