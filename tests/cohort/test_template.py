@@ -41,10 +41,21 @@ def test_everything_is_written(built):
     assert not (built.folder / "rounds" / "1" / "pairs" / "sub-0").exists()  # the reference itself
 
 
-def test_a_template_has_no_tissue(tmp_path):
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        ({"sliding": [1]}, "tissues and sliding are for pairs, a template has none; remove them"),
+        ({"labels_weight": 1.0}, r"labels that pull \(labels_weight\) are for pairs, a template has none"),
+        ({"features": "files"}, "features: files are for pairs, a template has none; remove them"),
+        ({"features": "missing.ts"}, "features: .*missing.ts does not exist"),
+    ],
+)
+def test_settings_that_do_not_suit_a_template_are_refused_before_any_round(tmp_path, settings, problem):
     write_images(tmp_path / "images")
-    with pytest.raises(InputError, match="tissues and sliding are for pairs, a template has none; remove them"):
-        build(cohort(tmp_path).model_copy(update={"settings": {"sliding": [1]}}))
+    asked = cohort(tmp_path).model_copy(update={"settings": settings})
+    with pytest.raises(InputError, match=problem):
+        build(asked)
+    assert not asked.out.exists()
 
 
 def test_it_is_what_the_library_makes(built):

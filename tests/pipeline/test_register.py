@@ -101,7 +101,7 @@ def test_features_of_a_program_and_of_files_are_the_same(folder, capsys):
     assert [record["settings"]["features"] for record in (first, second)] == ["net.ts", "files"]
     assert "ssd" in first["similarity_choice"]
     assert torchdeform(["check", "fixed.nrrd", "moving.nrrd", *files]) == 0
-    capsys.readouterr()
+    assert f"register will choose: {first['similarity_choice']}" in capsys.readouterr().out
     for words, problem in (
         ([*files[:2]], "--fixed-features needs --moving-features too"),
         ([*files, "--set", "features=mind"], "features are given twice, by --fixed-features"),

@@ -34,6 +34,7 @@ from torchdeform.pipeline.tissue import check_tissue
 from torchdeform.registration.affine.settings import ALIGNMENTS
 from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.placement import place
+from torchdeform.registration.settings import FILES, RegistrationSettings
 from torchdeform.report.figures import write_overlay
 
 Fixed = Annotated[
@@ -82,7 +83,8 @@ def check(
         *check_features(images, (read_optional(fixed_features), read_optional(moving_features))),
     )
     report = Report.made_of(*found.findings, *more)
-    predicted = None if report.of(ERROR) else _predicted(*images, *masks, align)
+    settings = load_settings("default", overrides={"align.kind": align, "features": fixed_features and FILES})
+    predicted = None if report.of(ERROR) else _predicted(*images, *masks, settings)
     drawn = _draw(out, *images) if out is not None else None
     (_print_json if json else _print_text)(images, report.findings, predicted, drawn)
     if report.of(ERROR):
@@ -96,10 +98,9 @@ def _check_annotations(image: Image, side: str, points: Path | None, labels: Pat
 
 
 def _predicted(
-    fixed: Image, moving: Image, fixed_mask: Image | None, moving_mask: Image | None, align: str
+    fixed: Image, moving: Image, fixed_mask: Image | None, moving_mask: Image | None, settings: RegistrationSettings
 ) -> str | None:
     """Return a sentence on the similarity that `register` will choose, or on why it cannot begin."""
-    settings = load_settings("default", overrides={"align.kind": align})
     try:
         return place(fixed, moving, settings, Annotations(fixed_mask=fixed_mask, moving_mask=moving_mask)).choice
     except TorchdeformError as error:

@@ -21,9 +21,11 @@ from torchdeform.core.warp import compose
 from torchdeform.errors import ComputationError, InputError
 from torchdeform.io import read_image, read_transform, write_image, write_transform
 from torchdeform.io.files import atomic_folder, remove_leftovers, require_writable
+from torchdeform.io.gate import require_file
 from torchdeform.io.images import ending_like, read_labels, write_labels
 from torchdeform.io.texts import read_json
 from torchdeform.pipeline.register import PairFiles, choose_device
+from torchdeform.registration.settings import FILES
 from torchdeform.registration.template import Lazy, Template, identity_map, make_template
 from torchdeform.report.figures import write_gallery
 from torchdeform.report.record import describe_map, versions, write_json
@@ -102,10 +104,7 @@ def build(cohort: Cohort, *, retry_failed: bool = False, report: Listener | None
         An image that cannot be registered in one round is left out of this round and of all later ones.
     """
     subjects = _subjects(cohort)
-    if cohort.resolve().knows_tissue:
-        raise InputError(
-            f"{cohort.path}: settings: tissues and sliding are for pairs, a template has none; remove them"
-        )
+    _require_for_templates(cohort)
     require_writable(cohort.out)
     for place in (cohort.out / SUBJECTS, *(cohort.out / SUBJECTS).glob("*")):
         remove_leftovers(place)
@@ -118,6 +117,24 @@ def build(cohort: Cohort, *, retry_failed: bool = False, report: Listener | None
         failures += failed
         rounds.append(current)
     return Built(cohort.out, _publish(rounds, template, cohort, failures), tuple(failures))
+
+
+def _require_for_templates(cohort: Cohort) -> None:
+    """Raise `InputError` if the settings ask for what a template has not, or for a program that is not there."""
+    settings = cohort.resolve()
+    pairs = {
+        "tissues and sliding": settings.knows_tissue,
+        "labels that pull (labels_weight)": settings.labels_weight > 0,
+        "features: files": FILES in settings.sources,
+    }
+    for what, asked in pairs.items():
+        if asked:
+            raise InputError(f"{cohort.path}: settings: {what} are for pairs, a template has none; remove them")
+    for program in settings.programs:
+        try:
+            require_file(Path(program), "program of features")
+        except InputError as error:
+            raise InputError(f"{cohort.path}: settings: features: {error}") from error
 
 
 def _subjects(cohort: Cohort) -> tuple[Subject, ...]:

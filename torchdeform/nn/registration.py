@@ -25,7 +25,7 @@ class DeformableRegistration(nn.Module):
         grid: the grid of images and displacement.
         steps: how many.
         settings: those of the preset ``default`` when None. Alignment, start, number of steps, tolerance and what is
-            said of levels, landmarks and ``symmetric`` are not looked at.
+            said of levels, landmarks and ``symmetric`` are not looked at. ``elasticity: auto`` is 0.2, as noise is not.
 
     Raises:
         InputError: steps below 1, a similarity that is a mixture or compares features (``mind``), or settings with

@@ -77,16 +77,17 @@ def register(
         are compared (see `corresponding_channels`), and ``warped`` is the moving image sampled once.
 
     Raises:
-        InputError: shapes, NaN or constant images, 2D against 3D, channels that do not
-            correspond, a start that folds, annotations that does not fit.
+        InputError: shapes, NaN or constant images, 2D against 3D, channels that do not correspond, a start that folds,
+            annotations that do not fit.
         ComputationError: the map is not finite.
 
     Notes:
-        One step: force = N ∂S/∂warped ∇warped; K v = M force + load of a divergence where the map is nearly folded, K
-        being the div-curl least squares with w_d, w_c and w_0 = w_d / length²; φ ← φ ∘ flow(v), the longest move being
-        ``step_length`` voxels, less where a one-sided determinant would fall below ``min_determinant``. A level keeps
-        its most similar map, and the result is never less similar than its start, over the same voxels. Items of a
-        batch do not influence each other. Liu, Liao & Xue 2007, section 2, with the controls driven by the images.
+        One step: force = N ∂S/∂warped ∇warped, evened; K v = M force + load of a divergence where the map is nearly
+        folded, K being the div-curl least squares with w_d, w_c and w_0 = w_d / length²; φ ← φ ∘ flow(v), the longest
+        move being ``step_length`` voxels, less where a one-sided determinant would fall below ``min_determinant``. A
+        level keeps its most similar map, and the result is never less similar than its start, over the same voxels.
+        Items of a batch do not influence each other. Liu, Liao & Xue 2007, section 2, with the controls driven by the
+        images.
         Landmarks add the force of their squared distance at the points. With ``symmetric`` two maps from a space
         between move against each other, and φ = φ_m ∘ φ_f⁻¹.
     """

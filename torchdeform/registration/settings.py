@@ -220,8 +220,8 @@ class KeypointSettings:
     Args:
         count: corners of the fixed image at most, at least 8; the strongest are taken.
         levels: pyramid levels to search on, coarse to fine, 0 being the images' own, as `DiscreteSettings`.
-        reach: longest displacement along an axis tried on each of them, in voxels of the images. A later level
-            corrects the ones before.
+        reach: longest displacement along an axis tried on each of them, in voxels of the images, and at most a third of
+            that axis. A later level corrects the ones before.
         neighbours: with how many of the nearest points each has to agree.
         coupling: prices of a squared step between a point and its neighbours, in standard deviations of the matching
             cost; they rise from the first round to the last.
