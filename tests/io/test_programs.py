@@ -29,7 +29,9 @@ def test_what_is_no_program_is_refused(tmp_path):
     save_script(network(2), tmp_path / "whole.ts")
     content = (tmp_path / "whole.ts").read_bytes()
     (tmp_path / "damaged.ts").write_bytes(content[:900].replace(b"PK", b"XX") + content[900:])
+    (tmp_path / "half.ts").write_bytes(content[: len(content) // 2])
     for name, problem in (
+        ("half.ts", "half.ts is damaged or incomplete"),
         ("weights.pt", "holds no program"),
         ("text.ts", "holds no program"),
         ("damaged.ts", "damaged|no program"),

@@ -4,13 +4,16 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from zipfile import BadZipFile, ZipFile, is_zipfile
+from zipfile import BadZipFile, ZipFile
 
 import torch
 from torch import Tensor
 
 from torchdeform.errors import InputError
-from torchdeform.io.gate import reading, require_file
+from torchdeform.io.gate import DAMAGED, reading, require_file
+
+# What archives begin with.
+_ARCHIVE = b"PK"
 
 Program = Callable[[Tensor], Tensor]
 
@@ -54,11 +57,12 @@ def quiet() -> Iterator[None]:
 
 def _names(path: Path) -> list[str]:
     """Return the names in an archive below its own folder; none where it is no archive."""
-    if not is_zipfile(path):
-        return []
+    with path.open("rb") as file:
+        if file.read(len(_ARCHIVE)) != _ARCHIVE:
+            return []
     try:
         with ZipFile(path) as archive:
             names = archive.namelist()
-    except BadZipFile:
-        return []
+    except BadZipFile as error:
+        raise InputError(f"{path} {DAMAGED}") from error
     return [name.partition("/")[2] for name in names]
