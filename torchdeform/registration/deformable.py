@@ -24,7 +24,7 @@ from torchdeform.registration.annotations import Annotations
 from torchdeform.registration.channels import count_features, settled, with_channels
 from torchdeform.registration.discrete import discrete_start
 from torchdeform.registration.evidence import gather_evidence, to_compare, with_labels
-from torchdeform.registration.keypoints import Keypoints, keypoint_start, too_few
+from torchdeform.registration.keypoints import Keypoints, anchors_of, keypoint_start, too_few
 from torchdeform.registration.objective import common_mask, forward_objective
 from torchdeform.registration.optimise import best_map, held_still, optimise_levels
 from torchdeform.registration.placement import Placement, place, problem_at
@@ -277,7 +277,8 @@ def _optimise(
     elif settings.sliding:
         u, records = optimise_sides(problem, settings, start, callback)
     else:
-        u, records = optimise_levels(problem, settings, start, callback)
+        anchored = replace(problem, anchors=anchors_of(points, problem.fixed))
+        u, records = optimise_levels(anchored, settings, start, callback)
     kept: tuple[TissueOutcome, ...] = ()
     with limit_threads(len(u), problem.grid):
         objective = forward_objective(problem, problem.grid, settings)

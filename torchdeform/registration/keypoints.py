@@ -7,6 +7,7 @@ from itertools import product
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from torchdeform.core.derivatives import cofactors, derivative, determinant
@@ -91,6 +92,21 @@ class Keypoints:
     def where(self, kept: Tensor | slice) -> "Keypoints":
         """Return the pairs that are kept, flags ``(n,)`` or a slice."""
         return Keypoints(self.fixed[:, kept], self.moving[:, kept], self.looked_for)
+
+
+def anchors_of(points: Sequence[Keypoints], like: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Return the pairs of all items ``(B, D, n)`` twice and how much each counts ``(B, 1, n)``, None where none does.
+
+    Items with fewer pairs than others are filled up with some that do not count, and the others count the more.
+    """
+    most = max((one.count for one in points if one.enough), default=0)
+    if most == 0:
+        return None
+    counts = [min(one.count, most) if one.enough else 0 for one in points]
+    sides = [[getattr(one, side)[:, :most] for one in points] for side in ("fixed", "moving")]
+    fixed, moving = (torch.stack([F.pad(s, (0, most - s.shape[1])) for s in side]).to(like) for side in sides)
+    counted = [[(most / n) ** 0.5] * n + [0.0] * (most - n) if n else [0.0] * most for n in counts]
+    return fixed, moving, torch.tensor(counted, dtype=like.dtype, device=like.device).unsqueeze(1)
 
 
 @torch.no_grad()

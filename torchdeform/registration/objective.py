@@ -153,6 +153,7 @@ class Objective:
     Attributes:
         similarity: S of the images, on their grid.
         landmarks: E of the pairs of points, on the grid of the map; None without.
+        points_weight: of E; the landmarks themselves have that of the settings.
         coupling: of the maps.
         more: wₖ Sₖ.
     """
@@ -161,6 +162,7 @@ class Objective:
     landmarks: Landmarks | None = None
     coupling: Coupling = _FREE
     more: tuple[Addition, ...] = ()
+    points_weight: float = 0.0
 
     def on_common_voxels(self, maps: Sequence[Tensor], transfer: Transfer | None) -> list[Tensor]:
         """Return S + Σ wₖ Sₖ of the maps, taken to the grid of the images, over what all of them see."""
@@ -187,4 +189,5 @@ def forward_objective(problem: RegistrationProblem, grid: Grid, settings: Regist
     pairs = problem.pairs if settings.points_weight > 0 else None
     channels = compared(problem, settings)
     first, *others = [forward_similarity(problem, one, settings) for one in channels]
-    return Objective(first, pairs and ForwardLandmarks(*pairs, grid), more=additions(others, channels[1:], grid))
+    landmarks, more = pairs and ForwardLandmarks(*pairs, grid), additions(others, channels[1:], grid)
+    return Objective(first, landmarks, more=more, points_weight=settings.points_weight)

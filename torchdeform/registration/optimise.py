@@ -19,6 +19,7 @@ from torchdeform.core.warp import compose
 from torchdeform.deformation.rigid import RigidHold
 from torchdeform.errors import InputError
 from torchdeform.metrics.correlation import window_mean
+from torchdeform.registration.landmarks import ForwardLandmarks
 from torchdeform.registration.objective import MakeObjective, Objective, forward_objective
 from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.result import Callback, LevelRecord, Progress
@@ -52,6 +53,9 @@ _ELASTICITY, _CALM, _PER_NOISE, _MOST_ELASTIC = 0.2, 0.1, 3.0, 0.4
 
 # A step that would fold is shortened around the folds first: so often, by this share, within so many nodes.
 _LOCAL_TRIES, _CUT, _WITHIN = 4, 0.7, 4
+
+# Price of points that were found, for a mean distance of a voxel of the level.
+_ANCHOR = 0.1
 
 # A similarity that is higher by a smaller share of itself is not higher: its last bits depend on the sums.
 _ROUNDING = 1e-6
@@ -189,7 +193,7 @@ def make_level(
     below = levels - 1 - index
     grid = _map_grid(problem.grid, settings, below)
     tissue = problem.tissue and problem.tissue.on(problem.grid, grid)
-    goal = objective(problem, grid, settings)
+    goal = _anchored(objective(problem, grid, settings), problem, grid, below / max(levels - 1, 1))
     return Level(
         objective=goal,
         metric=VelocityMetric.of(grid, settings.metric, settings.solver, problem.fixed, below, tissue),
@@ -203,6 +207,19 @@ def make_level(
         tissue=tissue,
         hold=None if tissue is None else tissue.hold(grid),
         voxel=min(problem.grid.spacing),
+    )
+
+
+def _anchored(goal: Objective, problem: RegistrationProblem, grid: Grid, share: float) -> Objective:
+    """Return the goal with points that were found, a share of their weight: 1 on the coarsest level, 0 on the finest.
+
+    What such a level shows blurred, or not at all, would else be moved away from where the points led it.
+    """
+    if problem.anchors is None or goal.landmarks is not None or share == 0:
+        return goal
+    weight = share * _ANCHOR / min(problem.grid.spacing) ** 2
+    return replace(
+        goal, landmarks=ForwardLandmarks(*problem.anchors[:2], grid, problem.anchors[2]), points_weight=weight
     )
 
 
@@ -260,7 +277,7 @@ def best_map(
     goals = values
     if objective.landmarks:
         distances = [objective.landmarks.evaluate(u).distance for u in maps]
-        goals = [v - settings.points_weight * d for v, d in zip(values, distances, strict=True)]
+        goals = [v - objective.points_weight * d for v, d in zip(values, distances, strict=True)]
     *others, (best, top, found) = zip(maps, goals, values, strict=True)
     for u, goal, value in reversed(others):
         better = goal > top + _ROUNDING * goal.abs()
@@ -286,7 +303,7 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     even, limit = settings.optimiser.evenness, settings.optimiser.limit
     whole = level.tissue is not None  # what is rigid turns as a whole
     force = force if even is None or whole else evened(force, even)
-    scale = settings.points_weight * math.prod(grid.shape) * channels  # to the unit of N ∂S/∂warped
+    scale = objective.points_weight * math.prod(grid.shape) * channels  # to the unit of N ∂S/∂warped
     load = None if points is None else points.load(grid) * scale
     # 3. Least squares: div and curl of the velocity are paid for, nearly folded places ask for divergence.
     barrier = level.voxel * fold_barrier(state.lowest, settings.folds.soft_determinant)
@@ -303,7 +320,7 @@ def _step(level: Level, state: State, step: int) -> tuple[State, bool]:
     # 4. and 5. Flow and guard: φ ← φ ∘ flow(v), no farther than where a determinant becomes too small.
     voxel = min(objective.similarity.grid.spacing) / min(grid.spacing)
     size = v.new_full((len(v),), voxel * step_size(settings.optimiser, step, level.steps)) * state.pace
-    if points is not None:
+    if points is not None and settings.points_weight > 0:
         size = points.line_search(v, grid).clamp(min=LAST_STEP * size, max=size)
     moved, u, lowest = fold_free_step(level, state, v * per_item(size * state.active, v))
     shortened = state.shortened + int((moved < 1).sum())
@@ -372,7 +389,7 @@ def _judged(level: Level, state: State, value: Tensor, distance: Tensor | None) 
     """Return the state with the best maps so far, and without the maps that gain no more."""
     if not level.keep_best:
         return replace(state, values=(*state.values, value.detach()))
-    goal = value if distance is None else value - level.settings.points_weight * distance
+    goal = value if distance is None else value - level.objective.points_weight * distance
     top = state.best_values[-1] if state.best_values else torch.full_like(goal, -torch.inf)
     better = goal > top
     best, top = where_items(better, state.u, state.best), where_items(better, goal, top)

@@ -73,6 +73,7 @@ class RegistrationProblem:
         tissue: what the fixed image is made of, None where nothing is said.
         sides: how much of each node belongs to each side of borders that glide ``(B or 1, K, *S)``, where the pairs are
             those of every side and item; None without.
+        anchors: pairs of points that were found ``(B, D, n)`` twice, and how much each counts ``(B, 1, n)``; or None.
         noise: `noise_share` of the noisier image of each pair ``(B,)``; None before the images are on their scale.
         features: channels of both images as they are given, or None.
         labels: of both images, whole numbers ``(B, 1, *S)``, where they are compared; or None.
@@ -90,6 +91,7 @@ class RegistrationProblem:
     held: tuple[int, ...] = ()
     tissue: Tissue | None = None
     sides: Tensor | None = None
+    anchors: tuple[Tensor, Tensor, Tensor] | None = None
     noise: Tensor | None = None
     features: tuple[Tensor, Tensor] | None = None
     labels: tuple[Tensor, Tensor] | None = None

@@ -110,7 +110,8 @@ def _objective(problem: RegistrationProblem, grid: Grid, settings: RegistrationS
 
     more = tuple(replace(one, similarity=joint(one.similarity)) for one in alone.more)
     points = alone.landmarks and _landmarks(problem, grid)
-    return Objective(joint(alone.similarity), points, Gliding(sides, grid, problem.held), more)
+    gliding = Gliding(sides, grid, problem.held)
+    return Objective(joint(alone.similarity), points, gliding, more, settings.points_weight)
 
 
 def _landmarks(problem: RegistrationProblem, grid: Grid) -> ForwardLandmarks | None:

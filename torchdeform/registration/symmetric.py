@@ -103,7 +103,8 @@ def symmetric_objective(problem: RegistrationProblem, grid: Grid, settings: Regi
     first, *others = [_mutual_term(problem, one, settings) for one in channels]
     pairs = problem.pairs if settings.points_weight > 0 else None
     more = additions(others, channels[1:], grid)
-    return Objective(first, pairs and MidspaceLandmarks(*pairs, grid), _Opposed(), more)
+    landmarks = pairs and MidspaceLandmarks(*pairs, grid)
+    return Objective(first, landmarks, _Opposed(), more, settings.points_weight)
 
 
 def _mutual_term(problem: RegistrationProblem, channels: Channels, settings: RegistrationSettings) -> SimilarityTerm:
