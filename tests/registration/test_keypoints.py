@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from nested_settings import settings_of
+from pictures import blobs
 from skimage.feature import corner_foerstner
 from torch import Tensor
 
@@ -15,6 +17,7 @@ from torchdeform.core.warp import sample, voxels, warp
 from torchdeform.errors import InputError
 from torchdeform.registration.keypoints import (
     Keypoints,
+    anchors_of,
     common_shift,
     corners,
     distinctiveness,
@@ -22,6 +25,10 @@ from torchdeform.registration.keypoints import (
     map_of,
     match_keypoints,
 )
+from torchdeform.registration.landmarks import ForwardLandmarks
+from torchdeform.registration.objective import forward_objective
+from torchdeform.registration.optimise import make_level
+from torchdeform.registration.problem import RegistrationProblem
 from torchdeform.registration.settings import KeypointSettings
 
 SETTINGS = KeypointSettings()
@@ -309,3 +316,31 @@ def test_few_points_have_few_neighbours():
     points = match_keypoints(fixed, moving, grid, settings=replace(SETTINGS, count=9, neighbours=16))
     assert points.looked_for == 9
     assert off(points, truth, grid).shape == (points.count,)
+
+
+def test_anchors_of_items_weigh_alike_whatever_their_number():
+    like = torch.zeros(3, 1, 8, 8)
+    few, many = (Keypoints(torch.rand(2, n), torch.rand(2, n), 100) for n in (10, 40))
+    none = Keypoints(torch.rand(2, 3), torch.rand(2, 3), 100)
+    fixed, moving, counted = anchors_of((few, none, many), like)
+    assert fixed.shape == moving.shape == (3, 2, 40)
+    landmarks = ForwardLandmarks(fixed, moving, Grid((8, 8)), counted)
+    found = landmarks.evaluate(torch.zeros(3, 2, 8, 8)).distance
+    alone = [(one.moving - one.fixed).square().sum(0).mean() for one in (few, many)]
+    torch.testing.assert_close(found, torch.stack([alone[0], torch.zeros(()), alone[1]]))
+    assert anchors_of((none, none), like) is None
+    assert anchors_of((), like) is None
+
+
+def test_points_hold_the_map_on_coarse_levels_and_let_go_on_the_finest():
+    grid = Grid((64, 64))
+    image = blobs((64, 64), 1)
+    points = torch.rand(1, 2, 20) * 40 + 10
+    problem = RegistrationProblem(grid, image, image, anchors=(points, points + 3.0, torch.ones(1, 1, 20)))
+    settings = settings_of(measure="lncc")
+    goals = [make_level(problem, settings, forward_objective, index, 3).objective for index in range(3)]
+    assert goals[0].points_weight > goals[1].points_weight > goals[2].points_weight == 0
+    assert goals[2].landmarks is None
+    given = replace(problem, fixed_points=points, moving_points=points)  # landmarks of the user come before
+    own = make_level(given, settings_of(measure="lncc", points_weight=2.0), forward_objective, 0, 3).objective
+    assert own.points_weight == 2.0
