@@ -36,3 +36,11 @@ def disc(shape: tuple[int, ...], centre: tuple[float, ...], radius: float) -> Te
     """1 inside a ball, 0 outside."""
     x = Grid(shape).points()
     return ((x - Grid(shape).along(centre, x)).square().sum(1, keepdim=True) < radius**2).float()
+
+
+def swell(grid: Grid, largest: float) -> Tensor:
+    """Return u of ``largest`` voxels in the middle, along a diagonal, 0 on the faces."""
+    unit = grid.points() / grid.along(grid.extent, grid.points())
+    wave = torch.sin(math.pi * unit).prod(dim=1, keepdim=True)
+    direction = [(-1) ** k / math.sqrt(grid.dim) for k in range(grid.dim)]
+    return largest * min(grid.spacing) * grid.along(direction, wave) * wave

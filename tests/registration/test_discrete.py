@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from pictures import swell
 from torch import Tensor
 
 import torchdeform as td
@@ -31,14 +32,6 @@ def spots(grid: Grid, seed: int = 0) -> Tensor:
     ring = torch.exp(-(((frequency - 0.16) / 0.05) ** 2))
     image = torch.fft.ifftn(torch.fft.fftn(noise, dim=grid.axes) * ring, dim=grid.axes).real
     return image / image.std()
-
-
-def swell(grid: Grid, largest: float) -> Tensor:
-    """Return u of ``largest`` voxels in the middle, along a diagonal, 0 on the faces."""
-    unit = grid.points() / grid.along(grid.extent, grid.points())
-    wave = torch.sin(math.pi * unit).prod(dim=1, keepdim=True)
-    direction = [(-1) ** k / math.sqrt(grid.dim) for k in range(grid.dim)]
-    return largest * min(grid.spacing) * grid.along(direction, wave) * wave
 
 
 def moved_pair(shape: tuple[int, ...], spacing: tuple[float, ...], largest: float = 12.0, seed: int = 0):

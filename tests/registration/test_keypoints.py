@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from nested_settings import settings_of
-from pictures import blobs
+from pictures import blobs, swell
 from skimage.feature import corner_foerstner
 from torch import Tensor
 
@@ -47,14 +47,6 @@ def structures(grid: Grid, width: float, seed: int = 0) -> Tensor:
     ring = torch.exp(-(((frequency * 2 * width - 1) / 0.3) ** 2))
     image = torch.fft.ifftn(torch.fft.fftn(noise, dim=grid.axes) * ring, dim=grid.axes).real
     return image / image.std()
-
-
-def swell(grid: Grid, largest: float) -> Tensor:
-    """Return u of ``largest`` voxels in the middle, along a diagonal, 0 on the faces."""
-    unit = grid.points() / grid.along(grid.extent, grid.points())
-    wave = torch.sin(math.pi * unit).prod(dim=1, keepdim=True)
-    direction = [(-1) ** k / math.sqrt(grid.dim) for k in range(grid.dim)]
-    return largest * min(grid.spacing) * grid.along(direction, wave) * wave
 
 
 def moved_pair(shape, spacing=None, largest: float = 10.0, width: float = 5.0, seed: int = 0):

@@ -210,7 +210,7 @@ def lncc(
     """
     fixed, warped = on_unit_scale(fixed, warped, mask, intensity_range)
     windows = _windows(fixed, relative_weight(mask, warped), window, stride)
-    warped_mean, variance = _moments(warped, windows.weight, windows.inverse_count, window, stride)
+    warped_mean, variance = moments(warped, windows.weight, windows.inverse_count, window, stride)
     product = box_sum(weighted(fixed * warped, windows.weight), window, stride) * windows.inverse_count
     covariance = _raised(product - windows.mean * warped_mean)
     return mean(covariance.square() / (windows.variance * (variance + LNCC_FLOOR)), windows.window_weight)
@@ -219,7 +219,7 @@ def lncc(
 def _windows(fixed: Tensor, weight: Tensor | None, window: int, stride: int) -> _Windows:
     ones = fixed.new_ones(1, 1, *fixed.shape[2:]) if weight is None else weight
     inverse_count = 1 / box_sum(ones, window, stride).clamp(min=_EMPTY)
-    middle, variance = _moments(fixed, weight, inverse_count, window, stride)
+    middle, variance = moments(fixed, weight, inverse_count, window, stride)
     counted = contrast(variance)
     counted = counted if weight is None else counted * centres(weight, stride)
     counted = counted / per_item(counted.flatten(1).mean(1).clamp(min=_FLAT), counted)
@@ -237,10 +237,10 @@ def contrast(variance: Tensor, deviation: float = LNCC_CONTRAST) -> Tensor:
     return square / (square + deviation**4)
 
 
-def _moments(
+def moments(
     image: Tensor, weight: Tensor | None, inverse_count: Tensor, window: int, stride: int
 ) -> tuple[Tensor, Tensor]:
-    """Return mean and variance in the window around each voxel."""
+    """Return mean and variance in the window around each voxel, of weighted voxels; 1 / weight of a window is given."""
 
     def powers(rows: slice) -> Tensor:
         part = image[:, :, rows]
@@ -272,7 +272,7 @@ def local_contrast(image: Tensor, window: int, deviation: float = LNCC_CONTRAST)
 
 def window_moments(image: Tensor, window: int) -> tuple[Tensor, Tensor]:
     """Return mean and variance of the part of the window around each voxel that is inside, both ``(B, C, *S)``."""
-    return _moments(image, None, 1 / box_sum(torch.ones_like(image[:1, :1]), window), window, 1)
+    return moments(image, None, 1 / box_sum(torch.ones_like(image[:1, :1]), window), window, 1)
 
 
 def window_mean(image: Tensor, window: int) -> Tensor:

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from torchdeform.core.resampling import box_sum, centres
 from torchdeform.metrics.base import weighted
-from torchdeform.metrics.correlation import LNCC_FLOOR, contrast
+from torchdeform.metrics.correlation import LNCC_FLOOR, contrast, moments
 
 # Windows in which noise is compared with contrast, and the way from one to the next.
 _WINDOW, _STRIDE = 9, 3
@@ -35,9 +35,8 @@ def noise_share(image: Tensor, mask: Tensor | None = None) -> Tensor:
         first = detail.narrow(axis, 0, 1)  # as many nodes as before: the first difference is 0
         detail = detail.diff(dim=axis, prepend=first) / 2**0.5
     count = box_sum(torch.ones_like(image[:1, :1]) if mask is None else mask, _WINDOW, _STRIDE).clamp(min=1e-6)
-    fields = torch.cat([image, image * image, detail * detail], dim=1)
-    mean, square, noise = (box_sum(weighted(fields, mask), _WINDOW, _STRIDE) / count).chunk(3, dim=1)
-    variance = (square - mean * mean).clamp(min=0)
+    variance = moments(image, mask, 1 / count, _WINDOW, _STRIDE)[1]
+    noise = box_sum(weighted(detail * detail, mask), _WINDOW, _STRIDE) / count
     seen = weighted(contrast(variance), None if mask is None else centres(mask, _STRIDE))
     share = (seen * noise / (variance + LNCC_FLOOR)).flatten(2).sum(2) / seen.flatten(2).sum(2).clamp(min=1e-6)
     return share.mean(1)

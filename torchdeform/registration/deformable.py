@@ -129,7 +129,8 @@ def _register_tensors(
 
 def _ready(problem: RegistrationProblem, settings: RegistrationSettings) -> tuple[RegistrationProblem, Regions | None]:
     """Return the problem on its scale, with all that is compared and without what is let go, and where that is."""
-    problem, regions = let_go(problem.scaled(settings), settings)
+    problem = problem.scaled(settings)
+    problem, regions = let_go(replace(problem, noise=problem.measured_noise()), settings)
     return with_channels(problem, settings), regions
 
 

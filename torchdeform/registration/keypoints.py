@@ -102,8 +102,8 @@ def anchors_of(points: Sequence[Keypoints], like: Tensor) -> tuple[Tensor, Tenso
     most = max((one.count for one in points if one.enough), default=0)
     if most == 0:
         return None
-    counts = [min(one.count, most) if one.enough else 0 for one in points]
-    sides = [[getattr(one, side)[:, :most] for one in points] for side in ("fixed", "moving")]
+    counts = [one.count if one.enough else 0 for one in points]
+    sides = [one.fixed for one in points], [one.moving for one in points]
     fixed, moving = (torch.stack([F.pad(s, (0, most - s.shape[1])) for s in side]).to(like) for side in sides)
     counted = [[(most / n) ** 0.5] * n + [0.0] * (most - n) if n else [0.0] * most for n in counts]
     return fixed, moving, torch.tensor(counted, dtype=like.dtype, device=like.device).unsqueeze(1)

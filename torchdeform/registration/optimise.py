@@ -206,7 +206,6 @@ def make_level(
         held=problem.held,
         tissue=tissue,
         hold=None if tissue is None else tissue.hold(grid),
-        voxel=min(problem.grid.spacing),
     )
 
 

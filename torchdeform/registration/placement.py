@@ -183,8 +183,7 @@ def _across_contrasts(problem: RegistrationProblem) -> str | dict[str, float]:
     With ``ngf`` beside ``mind`` label maps painted as T1 and T2 (noise of 5 to 10 %) end 0.02 Dice nearer; a spine with
     23 % of noise ends 0.06 to 0.09 farther.
     """
-    noise = 0.0 if problem.noise is None else float(problem.noise.amax())
-    edges = round(_EDGES * (1 - noise / _NOISY), 2)
+    edges = round(_EDGES * (1 - float(problem.measured_noise().amax()) / _NOISY), 2)
     return {"mind": 1.0, "ngf": edges} if edges > 0 else "mind"
 
 

@@ -74,7 +74,7 @@ class RegistrationProblem:
         sides: how much of each node belongs to each side of borders that glide ``(B or 1, K, *S)``, where the pairs are
             those of every side and item; None without.
         anchors: pairs of points that were found ``(B, D, n)`` twice, and how much each counts ``(B, 1, n)``; or None.
-        noise: `noise_share` of the noisier image of each pair ``(B,)``; None before the images are on their scale.
+        noise: that of each pair, see `measured_noise`; None where it was not measured.
         features: channels of both images as they are given, or None.
         labels: of both images, whole numbers ``(B, 1, *S)``, where they are compared; or None.
         channels: what is compared beside the intensities, or in their place.
@@ -134,8 +134,11 @@ class RegistrationProblem:
             (self.fixed_mask, self.moving_mask),
             jointly=needs_common_scale(settings.seen_by),
         )
-        noise = torch.maximum(noise_share(images[0], self.fixed_mask), noise_share(images[1], self.moving_mask))
-        return replace(self, fixed=images[0], moving=images[1], noise=noise)
+        return replace(self, fixed=images[0], moving=images[1])
+
+    def measured_noise(self) -> Tensor:
+        """Return `noise_share` of the noisier image of each pair ``(B,)``, the images being on their scale."""
+        return torch.maximum(noise_share(self.fixed, self.fixed_mask), noise_share(self.moving, self.moving_mask))
 
 
 def problem_of_tensors(fixed: Tensor, moving: Tensor, grid: Grid, annotations: Annotations) -> RegistrationProblem:
